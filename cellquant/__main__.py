@@ -1,0 +1,5 @@
+"""``python -m cellquant`` is the command ``cellquant``."""
+
+from cellquant.cli import main
+
+main()

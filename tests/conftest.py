@@ -1,0 +1,17 @@
+"""Shared fixtures: where the real recordings are."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+_BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """Folder of real recordings, from CELLQUANT_DATA or the shared folder beside the project."""
+    folder = Path(os.environ.get("CELLQUANT_DATA", _BESIDE))
+    if not folder.is_dir():
+        pytest.skip(f"no real recordings: {folder} does not exist; set CELLQUANT_DATA")
+    return folder
