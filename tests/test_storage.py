@@ -1,0 +1,108 @@
+"""Crash-safe output: complete or absent, whatever happens in between."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from cellquant.errors import InputError
+from cellquant.storage import RunRecord, atomic_path, content_key, digest, write_json
+
+
+def test_a_failing_block_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    target = tmp_path / "table.txt"
+    target.write_text("old")
+    with pytest.raises(RuntimeError, match="broke"), atomic_path(target) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError("broke")
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["table.txt"]
+
+
+def test_a_folder_is_replaced_whole(tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    for content in ("one", "two"):
+        with atomic_path(target) as temporary:
+            temporary.mkdir()
+            (temporary / content).write_text(content)
+    assert [p.name for p in target.iterdir()] == ["two"]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_killed_writer_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "table.txt"
+    target.write_text("old")
+    code = f"""
+        import time
+        from cellquant.storage import atomic_path
+        with atomic_path({str(target)!r}) as temporary:
+            temporary.write_text("half")
+            print("written", flush=True)
+            time.sleep(60)
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE
+    ) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        os.kill(writer.pid, signal.SIGKILL)
+    assert target.read_text() == "old"
+    with atomic_path(target) as temporary:
+        temporary.write_text("new")
+    assert target.read_text() == "new"
+
+
+def test_an_output_below_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(InputError, match="cannot write"),
+        atomic_path(tmp_path / "file" / "out") as temporary,
+    ):
+        temporary.write_text("never")
+
+
+def test_a_full_disk_is_an_input_error(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full")
+    with pytest.raises(InputError, match="No space left"), atomic_path(tmp_path / "a") as temporary:
+        temporary.symlink_to("/dev/full")
+        with temporary.open("w") as stream:
+            stream.write("x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_refuses_nan_and_is_stable(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "a.json", {"value": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+    write_json(tmp_path / "a.json", {"b": 1, "a": [2.5]})
+    assert (tmp_path / "a.json").read_text() == '{\n  "a": [\n    2.5\n  ],\n  "b": 1\n}\n'
+
+
+def test_digests_and_keys_change_with_content(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("one")
+    first, folder = digest(tmp_path / "a"), digest(tmp_path)
+    (tmp_path / "a").write_text("two")
+    assert digest(tmp_path / "a") != first
+    assert digest(tmp_path) != folder
+    assert content_key({"a": 1}) != content_key({"a": 2})
+    assert content_key({"a": 1, "b": 2}) == content_key({"b": 2, "a": 1})
+
+
+def test_the_record_names_stages_and_inputs(tmp_path: Path) -> None:
+    (tmp_path / "in").write_text("x")
+    record = RunRecord("track", {"pixel_size": 0.65})
+    record.add_input(tmp_path / "in")
+    with record.stage("read"):
+        pass
+    record.write(tmp_path / "out")
+    saved = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert saved["inputs"][str(tmp_path / "in")] == digest(tmp_path / "in")
+    assert saved["stages"][0]["stage"] == "read"
+    assert {"wall_s", "cpu_s"} <= set(saved["stages"][0])
+    assert saved["machine"]["cores"] >= 1
