@@ -72,6 +72,26 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(holder, ignore_errors=True)
 
 
+def check_output(path: str | Path) -> Path:
+    """Make sure that a folder can be made or written at `path`, without making anything.
+
+    Raises
+    ------
+    InputError
+        If `path` is a file, lies below a file, or its nearest existing folder is not writable.
+    """
+    path = Path(path)
+    nearest = path
+    while not nearest.exists() and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(
+            f"cannot write to {path}: {nearest} is not a folder that may be written; "
+            "choose another output path."
+        )
+    return path
+
+
 def _inside(path: Path, folder: Path) -> bool:
     return folder in (path, *path.parents)
 
@@ -193,7 +213,21 @@ class RunRecord:
 
     def write(self, folder: str | Path) -> None:
         """Write ``run.json`` into `folder`; call it last, when every other file is there."""
-        write_json(Path(folder) / MANIFEST, self.as_dict())
+        content = self.as_dict()
+        path = Path(folder) / MANIFEST
+        earlier = [r for r in _earlier(path) if r.get("command") != self.command]
+        if earlier:
+            content["earlier"] = earlier
+        write_json(path, content)
+
+
+def _earlier(path: Path) -> list[dict[str, Any]]:
+    """Records of other commands that wrote into the same folder, so that none is lost."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return [*content.pop("earlier", []), content]
+    except (OSError, ValueError, AttributeError, TypeError):
+        return []
 
 
 def machine() -> dict[str, Any]:

@@ -85,6 +85,18 @@ class Cells:
     occupied_area: np.ndarray[Any, np.dtype[np.float64]]
     faults: Mapping[str, int] = field(default_factory=dict)
 
+    def write(self, path: str | Path) -> None:
+        """Write the cells as parquet, with units, calibration and faults in the metadata."""
+        metadata = {
+            "pixel_size": self.pixel_size,
+            "frame_interval": self.frame_interval,
+            "field_of_view": list(self.field_of_view),
+            "n_frames": self.n_frames,
+            "occupied_area": [float(area) for area in self.occupied_area],
+            "faults": dict(self.faults),
+        }
+        write_table(self.table, path, units=self.units, metadata=metadata)
+
 
 @dataclass(frozen=True)
 class Tracks:
@@ -136,6 +148,52 @@ class Tracks:
         write_table(self.table, path, units=self.units, metadata=metadata)
 
 
+def read_cells(path: str | Path) -> Cells:
+    """Read cells written by `Cells.write`.
+
+    Parameters
+    ----------
+    path
+        A parquet file, or a folder that holds ``cells.parquet``.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is not a cells table, or lacks a column.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "cells.parquet"
+    table, units, metadata = read_table(path)
+    _require(table, CELL_COLUMNS, path, "cells")
+    try:
+        width, height = metadata["field_of_view"]
+        return Cells(
+            table=table,
+            units=units,
+            pixel_size=float(metadata["pixel_size"]),
+            frame_interval=float(metadata["frame_interval"]),
+            field_of_view=(float(width), float(height)),
+            n_frames=int(metadata["n_frames"]),
+            occupied_area=np.asarray(metadata["occupied_area"], dtype=np.float64),
+            faults=metadata["faults"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} has no usable calibration in its metadata ({error}); "
+            "make it again with 'cellquant track MASKS -o DIR'."
+        ) from error
+
+
+def _require(table: pd.DataFrame, columns: Mapping[str, str], path: Path, kind: str) -> None:
+    missing = [name for name in columns if name not in table.columns]
+    if missing:
+        raise InputError(
+            f"{path} is not a {kind} table: it lacks the columns {', '.join(missing)}; "
+            "make one with 'cellquant track MASKS -o DIR'."
+        )
+
+
 def read_tracks(path: str | Path) -> Tracks:
     """Read tracks written by `Tracks.write`.
 
@@ -157,12 +215,7 @@ def read_tracks(path: str | Path) -> Tracks:
     if path.is_dir():
         path = path / "tracks.parquet"
     table, units, metadata = read_table(path)
-    missing = [name for name in TRACK_COLUMNS if name not in table.columns]
-    if missing:
-        raise InputError(
-            f"{path} is not a tracks table: it lacks the columns {', '.join(missing)}; "
-            "make one with 'cellquant track MASKS -o DIR'."
-        )
+    _require(table, TRACK_COLUMNS, path, "tracks")
     try:
         box = metadata["box"]
         return Tracks(

@@ -23,7 +23,13 @@ ALLOWED: dict[str, set[str]] = {
     "track": FOUNDATION | {"observables", "statistics", "segment"},
     "sim": FOUNDATION | {"observables", "statistics"},
     "compare": FOUNDATION | {"observables", "statistics", "segment", "track", "sim"},
-    "batch": FOUNDATION | {"observables", "statistics", "segment", "track", "sim", "compare"},
+    "engines": FOUNDATION,
+    "pipeline": FOUNDATION | {"observables", "segment", "track", "sim"},
+    "study": FOUNDATION | {"observables", "statistics", "compare"},
+    "batch": FOUNDATION
+    | {"observables", "segment", "track", "sim"}
+    | {"pipeline", "engines", "study"},
+    "demo": FOUNDATION | {"observables", "segment", "track", "sim", "compare", "pipeline"},
 }
 FORBIDDEN = {"napari", "PyQt5", "PyQt6", "PySide2", "PySide6", "qtpy", "pickle", "shelve"}
 HEAVY = ("numba", "statsmodels", "matplotlib", "trackpy", "pandas", "scipy", "cv2", "zarr")

@@ -1,0 +1,81 @@
+"""Commands of the simulation side: simulate, render, sweep, convergence."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from cellquant.cli.console import note, say, step
+
+SceneFile = Annotated[
+    Path | None, typer.Argument(help="scene.toml; options given besides override it.")
+]
+
+
+class Contact(StrEnum):
+    exact = "exact"
+    quadrature = "quadrature"
+
+
+def simulate(
+    output: Annotated[Path, typer.Option("-o", "--output", help="The run, e.g. RUN.zarr.")],
+    scene: SceneFile = None,
+    phi: Annotated[float | None, typer.Option(help="Packing fraction.")] = None,
+    v0: Annotated[float | None, typer.Option(help="Self-propulsion speed, L0/t0.")] = None,
+    eta: Annotated[float | None, typer.Option(help="Line tension, k L0.")] = None,
+    cells: Annotated[int | None, typer.Option(help="Number of cells.")] = None,
+    polydispersity: Annotated[
+        float | None, typer.Option(help="Spread of the radii over their mean.")
+    ] = None,
+    modes: Annotated[int | None, typer.Option(help="Highest contour mode; 1 is rigid.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Saved time, t0.")] = None,
+    transient: Annotated[float | None, typer.Option(help="Time before it, t0, not saved.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
+    contact: Annotated[Contact | None, typer.Option(help="Contact rule.")] = None,
+    points: Annotated[
+        int | None, typer.Option(help="Contour points of the quadrature rule.")
+    ] = None,
+    integrator: Annotated[str | None, typer.Option(help="Name of the integrator.")] = None,
+    dt: Annotated[float | None, typer.Option(help="Time step, t0.")] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="Error tolerance of the adaptive integrator, L0.")
+    ] = None,
+    save_every: Annotated[float | None, typer.Option(help="Time between saved states, t0.")] = None,
+) -> None:
+    """Simulate one layer; run the same command again to resume one that was interrupted."""
+    from cellquant.config import SceneConfig, load, read_toml, validate
+    from cellquant.pipeline import simulate_scene
+
+    given: dict[str, Any] = {
+        "phi": phi,
+        "v0": v0,
+        "eta": eta,
+        "cells": cells,
+        "polydispersity": polydispersity,
+        "modes": modes,
+        "duration": duration,
+        "transient": transient,
+        "seed": seed,
+        "contact": None if contact is None else contact.value,
+        "points": points,
+        "integrator": integrator,
+        "dt": dt,
+        "tolerance": tolerance,
+        "save_every": save_every,
+    }
+    content = {} if scene is None else read_toml(scene)
+    if scene is not None:
+        load(scene, SceneConfig)
+    content |= {key: value for key, value in given.items() if value is not None}
+    config = validate(content, SceneConfig, where=str(scene or "options"))
+    run = simulate_scene(config, output, step=lambda label: step(label, unit="t0"))
+    for line in run.as_lines():
+        say(line)
+    note(f"wrote {output}")
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the program."""
+    for command in (simulate,):
+        app.command()(command)

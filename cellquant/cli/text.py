@@ -1,0 +1,92 @@
+"""Results in words: the lines that commands print."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cellquant.io import LabelStack
+    from cellquant.tables import Cells, Tracks
+
+
+def with_error(value: float | None, std_error: float | None, unit: str = "") -> str:
+    """Write a value with as many digits as its standard error allows, e.g. ``3.912 ± 0.014``.
+
+    Values without an error carry four significant digits.
+    """
+    from math import floor, isfinite, log10
+
+    suffix = f" {unit}" if unit else ""
+    if value is None or not isfinite(value):
+        return "not measurable"
+    if not std_error or not isfinite(std_error):
+        return f"{value:.4g}{suffix}"
+    digits = max(0, 1 - floor(log10(abs(std_error))))
+    return f"{value:.{digits}f} ± {std_error:.{digits}f}{suffix}"
+
+
+def track_lines(masks: "LabelStack", cells: "Cells", tracks: "Tracks") -> list[str]:
+    """What tracking found, and what it chose."""
+    calibration = masks.calibration
+    units = calibration.units
+    per_frame = cells.table.groupby("frame").size()
+    lines = [
+        f"frames: {masks.n_frames} of {masks.shape[1]} x {masks.shape[0]} px",
+        f"calibration: {calibration.pixel_size:g} {units.length} per px, "
+        f"{calibration.frame_interval:g} {units.time} per frame ({calibration.source})",
+        f"cells: {len(cells.table)} in all, {per_frame.min()} to {per_frame.max()} per frame",
+    ]
+    faults = {name: count for name, count in cells.faults.items() if count}
+    if faults:
+        found = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in faults.items())
+        lines.append(f"faults handled: {found}")
+    lines += [f"note: {text}" for text in masks.notes]
+    lines.append(f"tracks: {tracks.n_tracks}")
+    lines += _provenance_lines(tracks.provenance, units.length)
+    return lines
+
+
+def _provenance_lines(provenance: Mapping[str, Any], length_unit: str) -> list[str]:
+    lines = []
+    for name in ("divisions", "gaps_closed"):
+        if name in provenance:
+            lines.append(f"{name.replace('_', ' ')}: {provenance[name]}")
+    if "search_range" in provenance:
+        lines.append(f"search range: {provenance['search_range']:.4g} {length_unit}")
+    lines += [f"warning: {text}" for text in provenance.get("warnings", [])]
+    return lines
+
+
+def summary_lines(summary: Mapping[str, Any]) -> list[str]:
+    """The scalar results of `observe`, each with unit and standard error."""
+    length, time = summary["length_unit"], summary["time_unit"]
+    lines = []
+    shape = summary.get("shape_index")
+    if shape:
+        lines.append(
+            f"shape index: mean {with_error(shape['mean'], shape['std_error'])}, "
+            f"median {with_error(shape['median'], None)}, n = {shape['n']} contours"
+        )
+    density = summary.get("density")
+    if density:
+        unit = f"cells/{length}^2"
+        mean, error = density["mean"], density["std_error"]
+        if length == "um" and mean is not None:
+            unit, mean = "cells/mm^2", mean * 1e6
+            error = None if error is None else error * 1e6
+        lines.append(f"density: {with_error(mean, error, unit)}")
+    wave = summary.get("wave_number")
+    if wave and wave["q"] is not None:
+        lines.append(f"wave number: {wave['q']:.4g} 1/{length} ({wave['rule']})")
+    tau = summary.get("tau_alpha")
+    if tau:
+        if tau["value"] is None and tau["censored_at"] is not None:
+            lines.append(f"tau_alpha: > {tau['censored_at']:g} {time} (1/e not reached)")
+        else:
+            lines.append(f"tau_alpha: {with_error(tau['value'], tau['std_error'], time)}")
+    speed = summary.get("speed")
+    if speed:
+        lines.append(
+            f"speed: mean {with_error(speed['mean'], speed.get('std_error'))} {length}/{time} "
+            f"over {speed['dt']:g} {time}"
+        )
+    return lines

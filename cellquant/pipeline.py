@@ -1,0 +1,237 @@
+"""The jobs of one movie or one simulation, from input to a finished output folder.
+
+Shared by the command line, the batch and the demo, so that the three can never differ.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cellquant.errors import InputError
+from cellquant.storage import RunRecord, atomic_path, check_output
+
+if TYPE_CHECKING:
+    from cellquant.io import ImageStack, LabelStack
+    from cellquant.observables import Observables
+    from cellquant.tables import Cells, Tracks
+
+Progress = Callable[[int, int], None]
+Step = Callable[[str], AbstractContextManager[Progress | None]]
+
+
+def silent(label: str) -> AbstractContextManager[Progress | None]:
+    """Report no progress."""
+    return nullcontext()
+
+
+def track_movie(
+    masks: "LabelStack",
+    out: str | Path,
+    *,
+    raw: "ImageStack | None" = None,
+    options: Mapping[str, Any] | None = None,
+    export_ctc: bool = False,
+    step: Step = silent,
+) -> "tuple[Cells, Tracks, RunRecord]":
+    """Measure and link the cells of a movie; write cells, tracks and the record of the run.
+
+    Parameters
+    ----------
+    masks
+        The label masks, calibrated or read with ``units="pixel"``.
+    out
+        Output folder: ``cells.parquet``, ``tracks.parquet``, ``run.json``, and with `export_ctc`
+        the folder ``ctc``.
+    raw
+        The recorded movie, frame by frame the same as `masks`.
+    options
+        Keyword arguments of `cellquant.track.track_cells`.
+    step
+        Gives a progress callback for each stage.
+
+    Raises
+    ------
+    InputError
+        If the masks are not calibrated, cannot be read, hold no cell or a single frame, or the
+        output cannot be written.
+    """
+    from cellquant.segment import measure_cells
+    from cellquant.track import track_cells
+
+    folder = check_output(out)
+    calibrated = _calibration(masks)
+    if masks.n_frames < 2:
+        raise InputError(
+            f"{masks.path} holds a single frame, and tracking needs at least two; "
+            "for shapes alone use 'cellquant observe MASKS --only shape_index'."
+        )
+    chosen = dict(options or {})
+    record = RunRecord(
+        "track",
+        {**calibrated, "raw": None if raw is None else str(raw.path), **chosen},
+        notes=list(masks.notes),
+    )
+    with record.stage("digest"):
+        for stack in (masks, raw):
+            if stack is not None and stack.path is not None:
+                record.add_input(stack.path)
+    with record.stage("measure"), step("measure cells") as progress:
+        cells = measure_cells(masks, progress=progress)
+    if cells.table.empty:
+        raise InputError(
+            f"{masks.path} holds no cell in any of its {masks.n_frames} frames; "
+            "check that it is the mask stack and not the raw movie."
+        )
+    with record.stage("link"), step("link cells") as progress:
+        tracks = track_cells(cells, masks, raw=raw, progress=progress, **chosen)
+    record.counts = {
+        "frames": cells.n_frames,
+        "cells": len(cells.table),
+        "tracks": tracks.n_tracks,
+        "faults": dict(cells.faults),
+    }
+    with record.stage("write"):
+        with atomic_path(folder / "cells.parquet") as path:
+            cells.write(path)
+        with atomic_path(folder / "tracks.parquet") as path:
+            tracks.write(path)
+        if export_ctc:
+            from cellquant.io import write_ctc
+
+            write_ctc(folder / "ctc", masks, tracks.table)
+    record.write(folder)
+    return cells, tracks, record
+
+
+def _calibration(masks: "LabelStack") -> dict[str, Any]:
+    calibration = masks.calibration
+    return {
+        "pixel_size": calibration.pixel_size,
+        "frame_interval": calibration.frame_interval,
+        "length_unit": calibration.units.length,
+        "time_unit": calibration.units.time,
+        "calibration_source": calibration.source,
+    }
+
+
+def open_source(
+    source: str | Path,
+    *,
+    shapes_only: bool = False,
+    calibration: Mapping[str, Any] | None = None,
+    step: Step = silent,
+) -> "Tracks | Cells | Any":
+    """Open what can be observed: tracks, cells, a simulated run, or label masks for shapes alone.
+
+    Parameters
+    ----------
+    source
+        A folder with ``tracks.parquet``, a parquet table, a ``RUN.zarr``, or label masks.
+    shapes_only
+        Nothing but shapes will be asked for, so that a table of cells or a single frame will do.
+    calibration
+        Keyword arguments of `cellquant.io.read_labels`, for label masks.
+    step
+        Gives a progress callback for each stage.
+
+    Raises
+    ------
+    InputError
+        If the path is missing or is none of these.
+    """
+    from cellquant.tables import read_cells, read_tracks
+
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"{source} does not exist; give tracks, a run or label masks.")
+    if source.is_dir() and (source / "zarr.json").is_file():
+        from cellquant.sim import open_run
+
+        return open_run(source).to_tracks()
+    if source.is_dir() and (source / "tracks.parquet").is_file():
+        if shapes_only and (source / "cells.parquet").is_file():
+            return read_cells(source)
+        return read_tracks(source)
+    if source.suffix == ".parquet":
+        return read_cells(source) if source.name.startswith("cells") else read_tracks(source)
+    if not shapes_only:
+        raise InputError(
+            f"{source} holds neither tracks nor a simulated run; make tracks with "
+            f"'cellquant track {source} -o DIR' first, or ask for shapes alone with "
+            "'--only shape_index'."
+        )
+    from cellquant.io import read_labels
+    from cellquant.segment import measure_cells
+
+    masks = read_labels(source, **(calibration or {}))
+    with step("measure cells") as progress:
+        return measure_cells(masks, progress=progress)
+
+
+def observe_source(
+    source: str | Path,
+    out: str | Path,
+    *,
+    only: Sequence[str] | None = None,
+    options: Mapping[str, Any] | None = None,
+    calibration: Mapping[str, Any] | None = None,
+    step: Step = silent,
+) -> "tuple[Observables, RunRecord]":
+    """Measure the observables of a source and write ``summary.json`` and one table each.
+
+    Parameters
+    ----------
+    source, calibration, step
+        See `open_source`.
+    out
+        Output folder.
+    only
+        Names of the observables wanted; all when None.
+    options
+        Keyword arguments of `cellquant.observables.observe`.
+    """
+    from cellquant.observables import needs_tracks
+
+    folder = check_output(out)
+    record = RunRecord("observe", {"source": str(source), "only": only, **(options or {})})
+    with record.stage("read"):
+        data = open_source(
+            source,
+            shapes_only=only is not None and not needs_tracks(only),
+            calibration=calibration,
+            step=step,
+        )
+        record.add_input(_file_of(Path(source), data))
+    observables = observe_into(
+        data, folder, record, options={"only": only, **(options or {})}, step=step
+    )
+    record.write(folder)
+    return observables, record
+
+
+def observe_into(
+    data: Any,
+    folder: Path,
+    record: RunRecord,
+    *,
+    options: Mapping[str, Any] | None = None,
+    step: Step = silent,
+) -> "Observables":
+    """Observe tracks or cells and write the tables; the record is left for the caller to write."""
+    from cellquant.observables import observe
+
+    with record.stage("observe"), step("observe"):
+        observables = observe(data, **(options or {}))
+    with record.stage("write observables"):
+        observables.write(folder)
+    return observables
+
+
+def _file_of(source: Path, data: Any) -> Path:
+    """Return the file inside a source folder that the observables were computed from."""
+    from cellquant.tables import Cells
+
+    if not (source / "tracks.parquet").is_file():
+        return source
+    return source / ("cells.parquet" if isinstance(data, Cells) else "tracks.parquet")
