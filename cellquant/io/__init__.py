@@ -1,1 +1,17 @@
-"""Placeholder."""
+"""Movies in and out: TIFF stacks, folders of frames, tracking folders, calibration."""
+
+from cellquant.io.calibration import Calibration as Calibration
+from cellquant.io.stack import ImageStack as ImageStack
+from cellquant.io.stack import LabelStack as LabelStack
+from cellquant.io.stack import read_images as read_images
+from cellquant.io.stack import read_labels as read_labels
+from cellquant.io.stack import write_labels as write_labels
+
+__all__ = [
+    "Calibration",
+    "ImageStack",
+    "LabelStack",
+    "read_images",
+    "read_labels",
+    "write_labels",
+]
