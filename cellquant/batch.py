@@ -41,12 +41,15 @@ class StudyOutcome:
         Number of stacks worked on now, and finished by an earlier run.
     failures
         Reason by stack, for those that failed.
+    only_input_errors
+        Whether every failure is one of the input, none of the program.
     """
 
     folder: Path
     done: int
     skipped: int
     failures: dict[str, str] = field(default_factory=dict)
+    only_input_errors: bool = True
 
 
 def find_stacks(config: ExperimentConfig, base: Path) -> list[Task]:
@@ -210,7 +213,13 @@ def run_experiment(
                 write_study(folder, config, finished)
         write_json(folder / "failures.json", failures)
         record.write(folder)
-    return StudyOutcome(folder, len(waiting) - len(failures), len(tasks) - len(waiting), failures)
+    return StudyOutcome(
+        folder,
+        done=len(waiting) - len(failures),
+        skipped=len(tasks) - len(waiting),
+        failures=failures,
+        only_input_errors=all(o.is_input_error for o in outcomes if o.error is not None),
+    )
 
 
 def _label(task: Task) -> str:

@@ -26,6 +26,27 @@ def demo(
     note(f"open {report}")
 
 
+def run(
+    experiment: Annotated[Path, typer.Argument(help="experiment.toml")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Output folder.")],
+    workers: Annotated[int, typer.Option(help="Local worker processes.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address or scheduler file of a Dask cluster.")
+    ] = None,
+) -> None:
+    """Work through a whole study; run it again to resume, finished stacks are not repeated."""
+    from cellquant.batch import describe, run_experiment
+
+    with step("stacks", unit="stacks") as progress:
+        outcome = run_experiment(
+            experiment, output, workers=workers, scheduler=scheduler, progress=progress
+        )
+    for line in describe(outcome):
+        say(line)
+    if outcome.failures:
+        raise typer.Exit(2 if outcome.only_input_errors else 1)
+
+
 config = typer.Typer(help="Configuration files.", no_args_is_help=True)
 
 
@@ -42,4 +63,5 @@ def config_init(
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
     app.command()(demo)
+    app.command()(run)
     app.add_typer(config, name="config")
