@@ -1,1 +1,19 @@
-"""Placeholder."""
+"""Observables of trajectories and of cell shapes, each with its standard error."""
+
+from cellquant.observables.observe import (
+    Observables,
+    available_observables,
+    needs_tracks,
+    observe,
+)
+from cellquant.observables.smoothing import remove_drift, retain, smooth_tracks
+
+__all__ = [
+    "Observables",
+    "available_observables",
+    "needs_tracks",
+    "observe",
+    "remove_drift",
+    "retain",
+    "smooth_tracks",
+]

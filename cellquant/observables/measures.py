@@ -1,0 +1,182 @@
+"""One function per observable: from the shared context to summary entries and tables."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cellquant.observables.context import Context
+from cellquant.observables.shape import BORDER_RULE, cell_blocks, describe
+from cellquant.observables.windows import DENSITY_RULE, density_per_frame, mean_of_series
+
+
+@dataclass
+class Results:
+    """What has been measured so far."""
+
+    summary: dict[str, Any] = field(default_factory=dict)
+    tables: dict[str, pd.DataFrame] = field(default_factory=dict)
+
+
+Measure = Callable[[Context, Results], None]
+
+
+def _lag_columns() -> pd.DataFrame:
+    columns = {name: np.empty(0) for name in ("lag_time", "value", "std_error")}
+    return pd.DataFrame({**columns, "n_pairs": np.empty(0, dtype=np.int64)})
+
+
+def density(context: Context, out: Results) -> None:
+    frames = density_per_frame(context.source)
+    mean, error, method = mean_of_series(
+        frames["density"].to_numpy(), min(context.window_points, 24)
+    )
+    unit = context.source.units.length
+    out.summary["density"] = {
+        "mean": mean,
+        "std_error": error,
+        "unit": f"1/{unit}^2",
+        "count_per_area": float(frames["count_per_area"].mean()),
+        "rule": DENSITY_RULE,
+        "n_frames": len(frames),
+        "std_error_method": method,
+    }
+    if not np.isfinite(error):
+        out.summary["density"]["reason"] = (
+            "the movie is too short for two stretches of frames, so the error is not measurable"
+        )
+
+
+def _distribution(context: Context, out: Results, name: str) -> None:
+    rows = context.contours
+    values = rows[name].to_numpy(dtype=np.float64)
+    known = np.isfinite(values)
+    found = describe(values[known], cell_blocks(rows[known], context.box))
+    out.summary[name] = {**found.summary, "border_rule": BORDER_RULE}
+    if not known.any():
+        out.summary[name]["reason"] = "no cell away from the border has a measured contour"
+    out.tables[name] = found.table.rename(columns={"value": name, "density": "value"})
+
+
+def shape_index(context: Context, out: Results) -> None:
+    _distribution(context, out, "shape_index")
+
+
+def aspect_ratio(context: Context, out: Results) -> None:
+    _distribution(context, out, "aspect_ratio")
+
+
+def wave_number(context: Context, out: Results) -> None:
+    out.summary["wave_number"] = dict(context.wave_number)
+
+
+def speed(context: Context, out: Results) -> None:
+    from cellquant.observables.motion import speeds
+
+    if context.no_motion:
+        found = describe(np.empty(0), cell_blocks(context.source.table[:0], None))
+        out.summary["speed"] = {**found.summary, "reason": context.no_motion}
+    else:
+        values, blocks = speeds(context.paths)
+        found = describe(values, blocks)
+        out.summary["speed"] = dict(found.summary)
+        if values.size == 0:
+            out.summary["speed"]["reason"] = "no track has a position in two consecutive frames"
+    out.summary["speed"]["dt"] = context.tracks.frame_interval
+    out.tables["speed"] = found.table.rename(columns={"value": "speed", "density": "value"})
+
+
+def msd(context: Context, out: Results) -> None:
+    if context.no_motion:
+        out.summary["msd"] = {"exponent": None, "reason": context.no_motion}
+        out.tables["msd"] = _lag_columns()
+        return
+    from cellquant.observables.motion import growth_exponent
+
+    second, _ = context.moments
+    out.tables["msd"] = second.table()
+    out.summary["msd"] = {
+        **growth_exponent(second),
+        "n_pairs": int(second.counts.sum()),
+        "std_error_method": second.method,
+    }
+
+
+def _peak(table: pd.DataFrame, method: str) -> dict[str, Any]:
+    """Largest value of a curve, and whether it lies inside the measured range."""
+    value = table["value"].to_numpy()
+    known = np.flatnonzero(np.isfinite(value))
+    if known.size == 0:
+        return {
+            "value": None, "lag_time": None, "std_error": None,
+            "reason": "not measurable at any lag",
+        }  # fmt: skip
+    k = known[int(np.argmax(value[known]))]
+    at_edge = bool(k in (known[0], known[-1]))
+    found: dict[str, Any] = {
+        "value": value[k],
+        "lag_time": table["lag_time"].to_numpy()[k],
+        "std_error": table["std_error"].to_numpy()[k],
+        "n_pairs": int(table["n_pairs"].to_numpy()[k]),
+        "at_edge": at_edge,
+        "std_error_method": method,
+    }
+    if at_edge:
+        found["note"] = "the largest value is at an end of the measured lags: perhaps not a peak"
+    return found
+
+
+def alpha2(context: Context, out: Results) -> None:
+    from cellquant.observables.dynamics import alpha2_table
+
+    if context.no_motion:
+        out.summary["alpha2_peak"] = {"value": None, "reason": context.no_motion}
+        out.tables["alpha2"] = _lag_columns()
+        return
+    table = alpha2_table(*context.moments)
+    out.tables["alpha2"] = table
+    out.summary["alpha2_peak"] = _peak(table, context.moments[0].method)
+
+
+def _overlap_cutoff(context: Context) -> float | None:
+    given, d = context.settings.overlap_cutoff, context.diameter["mean_diameter"]
+    return given if given is not None else (None if d is None else 0.3 * d)
+
+
+def _overlap(context: Context, out: Results, table: str, key: str) -> None:
+    cutoff = _overlap_cutoff(context)
+    reason = context.no_motion
+    if reason is None and cutoff is None:
+        reason = "no cell away from the border has an area; give overlap_cutoff"
+    if reason is not None or cutoff is None:
+        out.summary[key] = {"value": None, "reason": reason}
+        out.tables[table] = _lag_columns()
+        return
+    from cellquant.observables.dynamics import overlap
+
+    found = overlap(context.paths, cutoff, lags=context.lags)
+    if "overlap" in context.wanted:
+        out.tables["overlap"] = found.overlap
+        out.summary["overlap"] = {"cutoff": cutoff, "cutoff_rule": _cutoff_rule(context)}
+    if "chi4" in context.wanted:
+        out.tables["chi4"] = found.susceptibility
+        out.summary["chi4_peak"] = {
+            **_peak(found.susceptibility, "jackknife over stretches of time origins"),
+            "cutoff": cutoff,
+        }
+
+
+def _cutoff_rule(context: Context) -> str:
+    return "given" if context.settings.overlap_cutoff is not None else "0.3 mean diameters"
+
+
+def overlap(context: Context, out: Results) -> None:
+    if "overlap" not in out.tables:
+        _overlap(context, out, "overlap", "overlap")
+
+
+def chi4(context: Context, out: Results) -> None:
+    if "chi4" not in out.tables:
+        _overlap(context, out, "chi4", "chi4_peak")

@@ -1,0 +1,97 @@
+"""Speeds, velocity correlation in time and space, and how the displacement grows."""
+
+from typing import Any
+
+import numpy as np
+
+from cellquant.observables.blocks import Blocks, jackknife_error, leave_one_out, spatial_blocks
+from cellquant.observables.dynamics import LagAverage
+from cellquant.observables.smoothing import FloatArray, IntArray
+from cellquant.observables.trajectories import Trajectories
+
+
+def steps(paths: Trajectories) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """Displacements between consecutive frames.
+
+    Returns
+    -------
+    dx, dy : numpy.ndarray
+        (n,) components.
+    track : numpy.ndarray
+        (n,) index of the track.
+    entry : numpy.ndarray
+        (n,) index of the earlier point in the arrays of `paths`.
+    """
+    row = np.repeat(np.arange(paths.n_tracks), np.diff(paths.offsets))
+    both = paths.valid[:-1] & paths.valid[1:] & (row[1:] == row[:-1])
+    entry = np.flatnonzero(both)
+    dx, dy = paths.x[entry + 1] - paths.x[entry], paths.y[entry + 1] - paths.y[entry]
+    return dx, dy, row[entry], entry
+
+
+def speeds(paths: Trajectories) -> tuple[FloatArray, Blocks]:
+    """Instantaneous speed ``|r(t + dt) - r(t)| / dt`` with dt one frame interval.
+
+    Returns
+    -------
+    values : numpy.ndarray
+        (n,) speeds in length per time.
+    blocks : Blocks
+        Replicate block of each, the tracks grouped in space.
+    """
+    dx, dy, track, _ = steps(paths)
+    blocks = spatial_blocks(paths.centre, box=paths.box)
+    values = np.hypot(dx, dy) / paths.frame_interval
+    return values, Blocks(blocks.index[track], blocks.n, blocks.method)
+
+
+def growth_exponent(second: LagAverage) -> dict[str, Any]:
+    """Exponent and apparent diffusion coefficient of the mean-square displacement.
+
+    The exponent is the least-squares slope of ln MSD against ln t over lags from a ninth to a
+    third of the longest; ``D = MSD/(4 t)`` at the largest of these lags. Both carry jackknife
+    errors.
+
+    Parameters
+    ----------
+    second
+        Squared displacements by block.
+
+    Returns
+    -------
+    dict
+        exponent, diffusion_coefficient, each with its std_error; fit_range. None with a reason
+        when fewer than three lags lie in the range or nothing moved.
+    """
+    time = second.lag_time
+    empty = {"exponent": None, "diffusion_coefficient": None, "fit_range": None}
+    if time.size == 0:
+        return {**empty, "reason": "no track has two points"}
+    fitted = (time >= time[-1] / 9) & (time <= time[-1] / 3)
+    fitted &= second.counts.sum(axis=0) > 0
+    if fitted.sum() < 3:
+        return {**empty, "reason": "fewer than three lags lie in the range of the fit"}
+    span = [float(time[fitted][0]), float(time[fitted][-1])]
+    log_time = np.log(time[fitted])
+    log_time = log_time - log_time.mean()
+
+    def fit(sums: FloatArray, counts: FloatArray) -> FloatArray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            curve = (sums / counts)[..., fitted]
+            slope = (np.log(curve) * log_time).sum(axis=-1) / np.sum(log_time**2)
+        return np.stack([slope, curve[..., -1] / (4 * span[1])], axis=-1)
+
+    whole = fit(second.sums.sum(axis=0), second.counts.sum(axis=0))
+    if not np.isfinite(whole[0]):
+        return {**empty, "fit_range": span, "reason": "no cell moved"}
+    error = jackknife_error(
+        fit(leave_one_out(second.sums), leave_one_out(second.counts)),
+        np.repeat(second.counts[:, fitted].sum(axis=1)[:, None], 2, axis=1),
+    )
+    return {
+        "exponent": whole[0],
+        "exponent_std_error": error[0],
+        "diffusion_coefficient": whole[1],
+        "diffusion_coefficient_std_error": error[1],
+        "fit_range": span,
+    }

@@ -1,0 +1,271 @@
+"""From tracks, cells or a run to `summary.json` and one tidy table per observable."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from cellquant.errors import InputError
+from cellquant.observables import measures, relaxations
+from cellquant.observables.context import Context, Settings
+from cellquant.observables.measures import Measure, Results
+from cellquant.tables import Cells, Tracks, Units, write_table
+
+
+class _Entry(NamedTuple):
+    meaning: str
+    needs_tracks: bool
+    measure: Measure
+
+
+_CATALOGUE: dict[str, _Entry] = {
+    "density": _Entry("number density", False, measures.density),
+    "shape_index": _Entry("distribution of P/sqrt(A)", False, measures.shape_index),
+    "aspect_ratio": _Entry("distribution of the aspect ratio", False, measures.aspect_ratio),
+    "wave_number": _Entry("q = 2 pi/d, and d", False, measures.wave_number),
+    "speed": _Entry("distribution of |v| over one frame interval", True, measures.speed),
+    "msd": _Entry("mean-square displacement", True, measures.msd),
+    "alpha2": _Entry("non-Gaussian parameter", True, measures.alpha2),
+    "self_intermediate_scattering": _Entry(
+        "F_s(q, t), isotropic average", True, relaxations.self_intermediate_scattering
+    ),
+    "tau_alpha": _Entry("time at which F_s falls to 1/e", True, relaxations.tau_alpha),
+    "windows": _Entry(
+        "density and tau_alpha per window and density bin", True, relaxations.windows
+    ),
+    "overlap": _Entry("self-overlap Q(t)", True, measures.overlap),
+    "chi4": _Entry("four-point susceptibility", True, measures.chi4),
+}
+
+
+@dataclass(frozen=True)
+class Observables:
+    """Everything measured from one source.
+
+    Attributes
+    ----------
+    summary
+        The content of ``summary.json``.
+    tables
+        Tidy tables by name of the observable.
+    units
+        Unit names of summary and tables.
+    """
+
+    summary: Mapping[str, Any]
+    tables: Mapping[str, pd.DataFrame]
+    units: Units
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def write(self, folder: str | Path) -> None:
+        """Write ``summary.json`` and ``NAME.parquet`` for every table.
+
+        Parameters
+        ----------
+        folder
+            Made when it does not exist. Equal observables give byte-equal files.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, table in self.tables.items():
+            write_table(table, folder / f"{name}.parquet", units=self.units)
+        text = json.dumps(self.summary, sort_keys=True, indent=1, allow_nan=False)
+        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+
+
+def available_observables() -> dict[str, str]:
+    """Names that may be asked for, and what they mean."""
+    return {name: entry.meaning for name, entry in _CATALOGUE.items()}
+
+
+def needs_tracks(names: Sequence[str]) -> bool:
+    """Whether any of the named observables needs trajectories; the others take cells.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown.
+    """
+    return any(_CATALOGUE[name].needs_tracks for name in _checked(names))
+
+
+def _checked(names: Sequence[str]) -> list[str]:
+    unknown = [name for name in names if name not in _CATALOGUE]
+    if unknown:
+        raise InputError(
+            f"there is no observable {unknown[0]!r}; choose from {', '.join(_CATALOGUE)}."
+        )
+    return [name for name in _CATALOGUE if name in set(names)]
+
+
+def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -> Observables:
+    """Measure observables of tracks, of a simulated run, or of cells.
+
+    Trajectories are first expressed relative to the centre of mass of the population, then those
+    without enough consecutive points are dropped, then they are smoothed: with five points in an
+    open field of view, not at all in a periodic box. ``summary["processing"]`` says what was done.
+
+    Parameters
+    ----------
+    source
+        `Tracks`; anything with a ``to_tracks()`` method, such as a run; or `Cells`, from which
+        only what needs no trajectories is measured.
+    only
+        Names out of `available_observables`; all that the source allows when None.
+    smoothing
+        Points of the moving average, odd; 5 in an open field and 1 in a box when None.
+    drift
+        Whether the motion of the centre of mass is removed.
+    min_points
+        Consecutive points a trajectory must have, 24 by default.
+    window
+        Frames of an analysis window; 24 in an open field and the whole run in a box when None.
+    bin_centres, bin_width
+        Density bins, in cells/mm^2.
+    wave_number
+        A number in inverse length units, "2pi/d" (default) or "structure_factor_peak".
+    scattering
+        "bessel" for the exact isotropic average, "vectors" for eight directions of q.
+    lags
+        Lags in frames; about 35 evenly spaced in the logarithm when None.
+    stride
+        Frames between time origins; 1, every origin, by default.
+    overlap_cutoff
+        Distance of the overlap function in length units; 0.3 mean diameters when None.
+    van_hove_lag
+        Lag of the van Hove function in time units; tau_alpha when None.
+    max_frames
+        Frames, evenly spaced, on which structure is measured; 32 by default.
+    condition, trial
+        Names written to ``relaxation_times.parquet``.
+
+    Returns
+    -------
+    Observables
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, a name needs trajectories that the source lacks, an option has no
+        such value, or a track has two positions in one frame.
+    """
+    if not isinstance(source, (Tracks, Cells)):
+        if not hasattr(source, "to_tracks"):
+            raise InputError(
+                f"observables are measured from tracks, cells or a run, got "
+                f"{type(source).__name__}; open the source first."
+            )
+        source = source.to_tracks()
+    wanted = _wanted(source, only)
+    settings = _settings(options)
+    context = Context(source, settings, wanted)
+    out = Results(_head(context))
+    for name in wanted:
+        _CATALOGUE[name].measure(context, out)
+    if needs_tracks(wanted):
+        out.summary["processing"] = _processing(context)
+    summary: dict[str, Any] = _plain(out.summary)
+    return Observables(summary, out.tables, source.units)
+
+
+def _wanted(source: Tracks | Cells, only: Sequence[str] | None) -> list[str]:
+    if only is None:
+        has_tracks = isinstance(source, Tracks)
+        return [name for name, entry in _CATALOGUE.items() if has_tracks or not entry.needs_tracks]
+    if isinstance(only, str):
+        raise InputError(f"only must be a list of names, got {only!r}; write only=[{only!r}].")
+    wanted = _checked(only)
+    if isinstance(source, Cells):
+        moving = [name for name in wanted if _CATALOGUE[name].needs_tracks]
+        if moving:
+            raise InputError(
+                f"{', '.join(moving)} needs trajectories, but the source is a table of cells; "
+                "track it first."
+            )
+    return wanted
+
+
+def _settings(options: Mapping[str, Any]) -> Settings:
+    unknown = sorted(set(options) - set(Settings.__dataclass_fields__))
+    if unknown:
+        raise TypeError(f"observe() has no option {unknown[0]!r}")
+    settings = Settings(**options)
+    rules = (
+        ("smoothing", settings.smoothing is None or _odd(settings.smoothing), "odd and >= 1"),
+        ("min_points", settings.min_points >= 2, ">= 2"),
+        ("window", settings.window is None or settings.window >= 2, ">= 2 frames"),
+        ("stride", settings.stride >= 1, ">= 1 frame"),
+        ("bin_width", settings.bin_width > 0, "> 0"),
+        ("max_frames", settings.max_frames >= 1, ">= 1"),
+        ("scattering", settings.scattering in ("bessel", "vectors"), "'bessel' or 'vectors'"),
+        ("wave_number", _is_wave_number(settings.wave_number), "> 0, '2pi/d' or "
+         "'structure_factor_peak'"),
+        ("overlap_cutoff", _positive(settings.overlap_cutoff), "> 0"),
+        ("van_hove_lag", _positive(settings.van_hove_lag), "> 0"),
+        ("lags", settings.lags is None or min(settings.lags, default=0) >= 1, ">= 1 frame each"),
+    )  # fmt: skip
+    for name, good, rule in rules:
+        if not good:
+            raise InputError(f"{name} must be {rule}, got {getattr(settings, name)!r}.")
+    return settings
+
+
+def _odd(points: int) -> bool:
+    return points >= 1 and points % 2 == 1
+
+
+def _positive(value: float | None) -> bool:
+    return value is None or (value > 0 and bool(np.isfinite(value)))
+
+
+def _is_wave_number(value: Any) -> bool:
+    if isinstance(value, str):
+        return value in ("2pi/d", "structure_factor_peak")
+    return isinstance(value, (int, float)) and _positive(float(value))
+
+
+def _head(context: Context) -> dict[str, Any]:
+    source, n_frames = context.source, context.n_frames
+    return {
+        "n_frames": n_frames,
+        "n_cells_mean": len(source.table) / n_frames if n_frames else None,
+        "n_tracks": source.n_tracks if isinstance(source, Tracks) else None,
+        "length_unit": source.units.length,
+        "time_unit": source.units.time,
+    }
+
+
+def _processing(context: Context) -> dict[str, Any]:
+    tracks = context.tracks
+    drift = context.unsmoothed.provenance.get("drift") if context.settings.drift else None
+    return {
+        "smoothing_points": max(context.smoothing, tracks.smoothing)
+        if tracks.smoothing == 1
+        else tracks.smoothing,
+        "smoothing_rule": "given"
+        if context.settings.smoothing is not None
+        else "5 in an open field of view, 1 in a periodic box",
+        "drift_removed": bool(drift and drift["removed"]),
+        "drift": drift,
+        "min_points": context.settings.min_points,
+        "n_tracks_retained": context.unsmoothed.n_tracks,
+        "window_points": context.window_points,
+        "time_origin_stride": context.settings.stride,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Python types only; NaN and infinity become None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
