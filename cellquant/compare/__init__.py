@@ -1,1 +1,1 @@
-"""Placeholder."""
+"""Experiment and simulation side by side: figures, reports, units, parameters."""

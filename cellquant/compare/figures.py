@@ -1,0 +1,313 @@
+"""Drawings of curves, histograms and maps, in the style of the page."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cellquant.compare.page import MINUS
+from cellquant.compare.svg import canvas, colour, series_colour, to_svg
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+_LEGEND_WIDTH = 62  # characters in a row of the legend
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a drawing.
+
+    Attributes
+    ----------
+    label
+        Its name in the legend.
+    x, y
+        (n,) points; those that are not finite are left out.
+    error
+        (n,) standard errors of y, drawn as a band; None where they are unknown.
+    series
+        Number of its colour.
+    kind
+        ``line``, ``points`` (with error bars), ``bars`` (x: centres of equal bins) or ``dashes``.
+    """
+
+    label: str
+    x: FloatArray
+    y: FloatArray
+    error: FloatArray | None = None
+    series: int = 0
+    kind: str = "line"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """An axis: its label, whether it is logarithmic, and its limits, from the data when None."""
+
+    label: str
+    log: bool = False
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A line to read a value off, across the drawing, with its name."""
+
+    value: float
+    label: str
+    axis: str = "x"
+    series: int | None = None
+    error: float | None = field(default=None)
+
+
+def draw_curves(
+    curves: Sequence[Curve],
+    name: str,
+    *,
+    x: Scale,
+    y: Scale,
+    marks: Sequence[Mark] = (),
+    legend_rows: int | None = None,
+) -> str:
+    """Draw curves in one pair of axes, as an ``<svg>`` element.
+
+    Parameters
+    ----------
+    curves
+        What to draw, in the order of the legend.
+    name
+        Name of the drawing on its page.
+    x, y
+        The axes.
+    marks
+        Lines at values worth reading off.
+    legend_rows
+        Height kept for the legend, so that drawings beside each other match; from the curves
+        when None.
+    """
+    rows = count_legend_rows(curves) if legend_rows is None else legend_rows
+    with canvas(height=3.3 + 0.2 * rows) as (figure, axes):
+        place = axes.get_position()
+        height = figure.get_figheight()
+        top = (height - 0.16 - 0.2 * rows) / height
+        axes.set_position((place.x0, place.y0, place.width, top - place.y0))
+        for curve in curves:
+            _draw(axes, curve)
+        _set_scales(axes, x, y)
+        for mark in marks:
+            _draw_mark(axes, mark)
+        if rows:
+            axes.legend(
+                loc="lower left",
+                bbox_to_anchor=(-0.02, 1.0),
+                ncols=_legend_columns(curves),
+                borderaxespad=0.2,
+                handletextpad=0.5,
+                columnspacing=1.4,
+                labelspacing=0.3,
+            )
+        return to_svg(figure, name)
+
+
+def count_legend_rows(curves: Sequence[Curve]) -> int:
+    """Rows that the legend of these curves takes; none for a single curve."""
+    named = [c for c in curves if c.label]
+    return math.ceil(len(named) / _legend_columns(curves)) if len(named) > 1 else 0
+
+
+def _legend_columns(curves: Sequence[Curve]) -> int:
+    named = [c for c in curves if c.label]
+    longest = max((len(c.label.replace("_{", "").replace("}", "")) for c in named), default=1)
+    return max(1, min(len(named), 4, _LEGEND_WIDTH // (longest + 6)))
+
+
+def common_limits(
+    values: Sequence[FloatArray], *, log: bool = False, margin: float = 0.04
+) -> tuple[float, float] | None:
+    """Limits that hold all finite values (all positive ones on a logarithmic axis)."""
+    joined = np.concatenate([np.zeros(0), *(np.asarray(v, dtype=np.float64) for v in values)])
+    joined = joined[np.isfinite(joined) & ((joined > 0) | (not log))]
+    if joined.size == 0:
+        return None
+    low, high = float(joined.min()), float(joined.max())
+    if log:
+        factor = (high / low) ** margin if high > low else 2.0
+        return low / factor, high * factor
+    pad = margin * (high - low) or abs(high) * 0.1 or 1.0
+    return low - pad, high + pad
+
+
+def draw_map(
+    values: FloatArray,
+    name: str,
+    *,
+    x: tuple[str, Sequence[float]],
+    y: tuple[str, Sequence[float]],
+    limits: tuple[float, float],
+    digits: int = 3,
+    faint: FloatArray | None = None,
+) -> str:
+    """Draw a table of numbers as coloured fields with the numbers written in them.
+
+    Parameters
+    ----------
+    values
+        (len(y values), len(x values)); NaN fields stay empty and are marked with a dash.
+    x, y
+        Label and values of columns and rows.
+    limits
+        Values of the first and last colour, the same for maps that stand beside each other.
+    faint
+        Same shape, standard errors, written below the numbers.
+    """
+    import matplotlib as mpl
+
+    columns, rows = len(x[1]), len(y[1])
+    shades = mpl.colormaps["cividis"]
+    span = (limits[1] - limits[0]) or 1.0
+    with canvas(height=max(2.2, 0.62 * rows + 1.1)) as (figure, axes):
+        for row in range(rows):
+            for column in range(columns):
+                value = values[row, column]
+                if not np.isfinite(value):
+                    axes.text(column, row, "–", ha="center", va="center", color=colour("muted"))
+                    continue
+                shade = shades((value - limits[0]) / span)
+                axes.add_patch(
+                    mpl.patches.Rectangle(
+                        (column - 0.49, row - 0.48), 0.98, 0.96, facecolor=shade, linewidth=0
+                    )
+                )
+                luminance = float(np.dot(shade[:3], (0.299, 0.587, 0.114)))
+                text = f"{value:.{digits}f}"
+                if faint is not None and np.isfinite(faint[row, column]):
+                    text += f"\n±{faint[row, column]:.{digits}f}"
+                axes.text(
+                    column,
+                    row,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=9,
+                    color="#000000" if luminance > 0.52 else "#ffffff",
+                )
+        axes.set_xlim(-0.5, columns - 0.5)
+        axes.set_ylim(-0.5, rows - 0.5)
+        axes.set_xticks(range(columns), [f"{v:g}" for v in x[1]])
+        axes.set_yticks(range(rows), [f"{v:g}" for v in y[1]])
+        axes.set_xlabel(x[0])
+        axes.set_ylabel(y[0])
+        axes.tick_params(length=0)
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+        return to_svg(figure, name)
+
+
+def _draw(axes: "Axes", curve: Curve) -> None:
+    finite = np.isfinite(curve.x) & np.isfinite(curve.y)
+    x, y = curve.x[finite], curve.y[finite]
+    shade = series_colour(curve.series)
+    if curve.kind == "bars":
+        width = float(np.min(np.diff(x))) if x.size > 1 else 1.0
+        axes.stairs(
+            y,
+            np.append(x - width / 2, x[-1:] + width / 2),
+            fill=True,
+            facecolor=shade,
+            alpha=0.28,
+            label=curve.label,
+        )
+        axes.stairs(y, np.append(x - width / 2, x[-1:] + width / 2), color=shade, linewidth=1.2)
+        return
+    error = None if curve.error is None else curve.error[finite]
+    if curve.kind == "points":
+        bars = None if error is None else np.nan_to_num(error)
+        axes.errorbar(
+            x, y, bars, color=shade, label=curve.label, fmt="o", markersize=4.5, elinewidth=1.1
+        )
+        return
+    dashes: dict[str, Any] = (
+        {"linestyle": (0, (4, 2.5)), "linewidth": 1.3} if curve.kind == "dashes" else {}
+    )
+    axes.plot(x, y, color=shade, label=curve.label, **dashes)
+    if error is not None and np.isfinite(error).any():
+        spread = np.nan_to_num(error)
+        axes.fill_between(x, y - spread, y + spread, color=shade, alpha=0.2, linewidth=0)
+
+
+def _draw_mark(axes: "Axes", mark: Mark) -> None:
+    shade = colour("muted") if mark.series is None else series_colour(mark.series)
+    if mark.axis == "y":
+        axes.axhline(mark.value, color=shade, linewidth=1, linestyle=(0, (2, 2)))
+        axes.annotate(
+            mark.label,
+            (1.0, mark.value),
+            xycoords=("axes fraction", "data"),
+            xytext=(-2, 3),
+            textcoords="offset points",
+            ha="right",
+            fontsize=9,
+            color=shade,
+        )
+        return
+    if mark.error is not None and np.isfinite(mark.error) and mark.error > 0:
+        axes.axvspan(
+            mark.value - mark.error, mark.value + mark.error, color=shade, alpha=0.16, lw=0
+        )
+    axes.axvline(mark.value, color=shade, linewidth=1, linestyle=(0, (2, 2)))
+    low, high = axes.get_xlim()
+    if axes.get_xscale() == "log":
+        fraction = math.log(mark.value / low) / math.log(high / low)
+    else:
+        fraction = (mark.value - low) / (high - low)
+    right = fraction > 0.72
+    # Marks close to each other step down, so that their names stay apart.
+    step = sum(1 for text in axes.texts if text.get_gid() == "mark")
+    text = axes.annotate(
+        mark.label,
+        (mark.value, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(-4 if right else 4, -9 - 12 * step),
+        textcoords="offset points",
+        ha="right" if right else "left",
+        fontsize=9,
+        color=shade,
+    )
+    text.set_gid("mark")
+
+
+def _set_scales(axes: "Axes", x: Scale, y: Scale) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+    for scale, axis, set_scale, set_limits in (
+        (x, axes.xaxis, axes.set_xscale, axes.set_xlim),
+        (y, axes.yaxis, axes.set_yscale, axes.set_ylim),
+    ):
+        axis.set_label_text(scale.label)
+        if scale.log:
+            set_scale("log")
+        if scale.limits is not None:
+            set_limits(*scale.limits)
+        if not scale.log:
+            axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+            continue
+        low, high = axis.get_view_interval()
+        decades = math.log10(high / low) if low > 0 else 1.0
+        steps = (1.0,) if decades > 2.2 else (1.0, 2.0, 5.0)
+        axis.set_major_locator(LogLocator(subs=steps))
+        axis.set_major_formatter(FuncFormatter(_log_tick))
+        axis.set_minor_locator(LogLocator(subs=tuple(range(1, 10))))
+        axis.set_minor_formatter(NullFormatter())
+        axis.set_tick_params(which="minor", length=2)
+
+
+def _log_tick(value: float, _position: int | None) -> str:
+    if 1e-3 < value < 1e5:
+        return f"{value:g}"
+    exponent = math.floor(math.log10(value) + 1e-9)
+    mantissa = value / 10.0**exponent
+    power = f"10^{{{str(exponent).replace('-', MINUS)}}}"
+    return power if abs(mantissa - 1) < 1e-6 else f"{mantissa:g}·{power}"

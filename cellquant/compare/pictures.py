@@ -1,0 +1,283 @@
+"""Pictures of a layer: segmented frames, a simulated snapshot, and the paths of the cells."""
+
+import base64
+import math
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cellquant.compare.results import unit_text
+from cellquant.compare.svg import (
+    N_SERIES,
+    canvas,
+    colour,
+    compact_path,
+    follow_theme,
+    series_colour,
+    to_svg,
+)
+from cellquant.tables import Units
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
+MAX_PIXELS = 900
+MAX_POINTS = 12_000
+# Twelve tones of like lightness, readable on light and on dark ground (RGB).
+_TONES = np.array(
+    [
+        (121, 167, 211), (222, 155, 112), (117, 185, 165), (176, 150, 210),
+        (205, 176, 104), (214, 140, 160), (140, 186, 120), (146, 161, 222),
+        (219, 168, 136), (108, 180, 197), (191, 160, 187), (176, 179, 126),
+    ],
+    dtype=np.uint8,
+)  # fmt: skip
+
+
+def draw_masks(
+    labels: IntArray,
+    *,
+    pixel_size: float,
+    units: Units,
+    raw: np.ndarray[Any, Any] | None = None,
+    identities: Mapping[int, int] | None = None,
+) -> str:
+    """Draw one frame of label masks with a scale bar, as an ``<svg>`` element.
+
+    Parameters
+    ----------
+    labels
+        (H, W) label masks, 0 for background.
+    pixel_size
+        Edge of a pixel, in ``units.length``.
+    units
+        Unit names, for the scale bar.
+    raw
+        (H, W) recorded image; when given, it is shown in grey with the outlines of the cells.
+    identities
+        Track of each label: a cell then keeps its colour through the movie.
+
+    Returns
+    -------
+    str
+        The element; the picture inside has at most `MAX_PIXELS` pixels along an edge.
+    """
+    height, width = labels.shape
+    step = max(1, math.ceil(max(height, width) / MAX_PIXELS))
+    seen = np.ascontiguousarray(labels[::step, ::step])
+    tones = _tones_of(seen, identities)
+    inside = seen > 0
+    edge = _edges(seen)
+    if raw is None:
+        picture = np.dstack([tones, np.where(inside, 255, 0).astype(np.uint8)])
+        picture[edge, :3] = (picture[edge, :3] * 0.55).astype(np.uint8)
+        data, kind = _encode(picture, ".png"), "png"
+    else:
+        grey = _to_grey(raw[::step, ::step])
+        picture = np.dstack([grey, grey, grey])
+        picture[edge] = tones[edge]
+        data, kind = _encode(picture, ".jpg"), "jpeg"
+    body = (
+        f'<image width="{width}" height="{height}" preserveAspectRatio="none" '
+        f'href="data:image/{kind};base64,{base64.b64encode(data).decode()}"/>'
+    )
+    return _framed(body, width, height, scale=1 / pixel_size, length_unit=units.length)
+
+
+def draw_contours(
+    contours: FloatArray,
+    box: tuple[float, float],
+    *,
+    units: Units,
+    identities: IntArray | None = None,
+) -> str:
+    """Draw the contours of a simulated layer in its periodic box, as an ``<svg>`` element.
+
+    Parameters
+    ----------
+    contours
+        (N, K, 2) contour points of each cell, in ``units.length``.
+    box
+        Edges of the periodic box.
+    identities
+        (N,) numbers that choose the colours; the order of the cells when None.
+    """
+    size = 600.0
+    scale = size / max(box)
+    width, height = box[0] * scale, box[1] * scale
+    order = np.arange(len(contours)) if identities is None else identities
+    groups: dict[int, list[str]] = {}
+    for number, contour in zip(order, contours, strict=True):
+        home = contour - np.floor(contour.mean(axis=0) / box) * box
+        low, high = home.min(axis=0), home.max(axis=0)
+        shifts = [
+            [0.0, *([edge] if low[axis] < 0 else []), *([-edge] if high[axis] > edge else [])]
+            for axis, edge in enumerate(box)
+        ]
+        for shift_x in shifts[0]:
+            for shift_y in shifts[1]:
+                points = (home + np.array([shift_x, shift_y])) * scale
+                text = " L ".join(f"{px} {py}" for px, py in points)
+                groups.setdefault(_tone(int(number)), []).append(compact_path(f"M {text} z"))
+    paths = "".join(
+        f'<path d="{"".join(groups[tone])}" fill="{_hex(tone)}" stroke="{_hex(tone, 0.55)}"/>'
+        for tone in sorted(groups)
+    )
+    body = f'<g fill-opacity=".82" stroke-width="1" stroke-linejoin="round">{paths}</g>'
+    return _framed(body, width, height, scale=scale, length_unit=units.length)
+
+
+def thin_paths(table: pd.DataFrame, *, max_points: int = MAX_POINTS) -> pd.DataFrame:
+    """Keep as many points of the trajectories as a drawing can show.
+
+    Whole tracks are kept while they fit (longest first), each thinned to every k-th frame with
+    its first and last point.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns track_id, frame, x, y, in the order of track and frame.
+    """
+    rows = table[["track_id", "frame", "x", "y"]].sort_values(["track_id", "frame"])
+    group = rows.groupby("track_id", sort=False)
+    rank, length = group.cumcount(), group["frame"].transform("size")
+    every = max(1, math.ceil(len(rows) / max_points))
+    every = min(every, 6)
+    rows = rows[(rank % every == 0) | (rank == length - 1)]
+    length = rows.groupby("track_id")["frame"].transform("size")
+    rows = rows[length > 1]
+    lengths = rows.groupby("track_id").size().sort_values(ascending=False, kind="stable")
+    kept = lengths.index[lengths.cumsum() <= max_points]
+    return rows[rows["track_id"].isin(kept)].reset_index(drop=True)
+
+
+def draw_paths(
+    paths: pd.DataFrame,
+    name: str,
+    *,
+    units: Units,
+    window: tuple[float, float, float, float],
+    frame: tuple[float, float, float, float] | None = None,
+) -> str:
+    """Draw trajectories as seen in the image (y downwards), as an ``<svg>`` element.
+
+    Parameters
+    ----------
+    paths
+        Columns track_id, frame, x, y.
+    name
+        Name of the drawing on its page.
+    units
+        Unit names for the axes.
+    window
+        x from, x to, y from, y to of the part shown.
+    frame
+        The same, of a rectangle to mark.
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import Rectangle
+
+    left, right, low, high = window
+    with canvas(height=4.8) as (figure, axes):
+        inside = paths["x"].between(left, right) & paths["y"].between(low, high)
+        shown = paths[paths["track_id"].isin(paths.loc[inside, "track_id"].unique())]
+        for series in range(N_SERIES):
+            lines = [
+                track[["x", "y"]].to_numpy()
+                for _, track in shown[shown["track_id"] % N_SERIES == series].groupby("track_id")
+            ]
+            axes.add_collection(LineCollection(lines, colors=series_colour(series), linewidths=0.8))
+            ends = [line[-1] for line in lines]
+            if ends and len(shown) < 3000:
+                axes.plot(*np.transpose(ends), ".", color=series_colour(series), markersize=3)
+        if frame is not None:
+            a, b, c, d = frame
+            axes.add_patch(
+                Rectangle((a, c), b - a, d - c, fill=False, edgecolor=colour("ink"), linewidth=1.2)
+            )
+        axes.set_xlim(left, right)
+        axes.set_ylim(high, low)
+        axes.set_aspect("equal", adjustable="box", anchor="NW")
+        unit = unit_text((1, 0), units)
+        axes.set_xlabel(f"x ({unit})")
+        axes.set_ylabel(f"y ({unit})")
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(True)
+        return to_svg(figure, name)
+
+
+def _framed(body: str, width: float, height: float, *, scale: float, length_unit: str) -> str:
+    """Put a picture above its scale bar; `scale` is drawing units per length unit."""
+    bar = _round_length(width / scale / 5)
+    length = bar * scale
+    size = max(width, height) / 26
+    label = escape(f"{bar:g} {length_unit.replace('um', 'µm').replace('L0', 'L₀')}")
+    ink = colour("ink")
+    return follow_theme(
+        f'<svg xmlns="http://www.w3.org/2000/svg" '
+        f'viewBox="0 0 {width:g} {height + 1.9 * size:g}">'
+        f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}">'
+        f"{body}</svg>"
+        f'<rect width="{width:g}" height="{height:g}" '
+        f'style="fill: none; stroke: {colour("rule")}; stroke-width: {size / 14:.2f}"/>'
+        f'<rect y="{height + 0.95 * size:g}" width="{length:.1f}" height="{size / 4:.1f}" '
+        f'style="fill: {ink}"/>'
+        f'<text x="{length + size / 2:.1f}" y="{height + 1.42 * size:.1f}" '
+        f'style="fill: {ink}; font-family: sans-serif; font-size: {size:.1f}px">{label}</text>'
+        f"</svg>"
+    )
+
+
+def _round_length(length: float) -> float:
+    power = 10.0 ** math.floor(math.log10(length))
+    return max(m for m in (1.0, 2.0, 5.0) if m * power <= length * (1 + 1e-9)) * power
+
+
+def _tone(identity: int) -> int:
+    return (identity * 2654435761 % 2**32) * len(_TONES) >> 32
+
+
+def _hex(tone: int, factor: float = 1.0) -> str:
+    return "#" + "".join(f"{int(c * factor):02x}" for c in _TONES[tone])
+
+
+def _tones_of(
+    labels: IntArray, identities: Mapping[int, int] | None
+) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    present, inverse = np.unique(labels, return_inverse=True)
+    known = identities or {}
+    tones = np.array([_TONES[_tone(known.get(int(v), int(v)))] for v in present], dtype=np.uint8)
+    tones[present <= 0] = 0
+    out: np.ndarray[Any, np.dtype[np.uint8]] = tones[inverse.reshape(labels.shape)]
+    return out
+
+
+def _edges(labels: IntArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    edge = np.zeros(labels.shape, dtype=bool)
+    edge[:-1] |= labels[:-1] != labels[1:]
+    edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
+    return edge
+
+
+def _to_grey(raw: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    low, high = np.percentile(raw, (0.5, 99.5))
+    span = float(high - low) or 1.0
+    grey: np.ndarray[Any, np.dtype[np.uint8]] = (
+        np.clip((raw.astype(np.float64) - low) / span, 0, 1) * 255
+    ).astype(np.uint8)
+    return grey
+
+
+def _encode(picture: np.ndarray[Any, np.dtype[np.uint8]], suffix: str) -> bytes:
+    import cv2
+
+    order = [2, 1, 0, 3][: picture.shape[2]]
+    options = (
+        [cv2.IMWRITE_PNG_COMPRESSION, 9] if suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 78]
+    )
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(picture[..., order]), options)
+    if not done:
+        raise ValueError(f"could not encode a picture of shape {picture.shape} as {suffix}")
+    return bytes(data.tobytes())

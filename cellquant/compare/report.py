@@ -1,0 +1,357 @@
+"""The report of one experiment: from masks to numbers, on one page."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cellquant import __version__
+from cellquant.compare import panels
+from cellquant.compare.page import (
+    Figure,
+    Headline,
+    Page,
+    Row,
+    Section,
+    Settings,
+    Table,
+    flatten,
+    format_value,
+    write_page,
+)
+from cellquant.compare.results import (
+    Result,
+    Scalar,
+    look_up,
+    pretty_unit,
+    read_result,
+    read_scalars,
+    reasons,
+)
+
+if TYPE_CHECKING:
+    from cellquant.io import ImageStack, LabelStack
+    from cellquant.observables import Observables
+    from cellquant.tables import Cells, Tracks
+
+_LIBRARIES = ("numpy", "scipy", "numba", "pandas", "opencv-python-headless", "matplotlib")
+_HEADLINES = ("density.mean", "shape_index.mean", "tau_alpha.value", "speed.mean")
+# What the counts of faults mean, in words; others are listed under their own name.
+_FAULTS = {
+    "fragments": "labels in several pieces: the largest piece was measured",
+    "holes": "labels with a hole: the hole was filled for the contour",
+    "specks": "pieces of a few pixels, left out",
+    "border": "cells cut by the edge of the image: tracked, but left out of the shape index",
+    "duplicate_frames": "frames equal to the one before",
+    "empty_frames": "frames without a cell",
+    "missing_frames": "frame numbers without a file",
+}
+
+
+def experiment_report(
+    *,
+    title: str,
+    tracks: "Tracks",
+    observables: "Observables | Result",
+    settings: Mapping[str, Any],
+    out: str | Path,
+    stack: "LabelStack | None" = None,
+    raw: "ImageStack | None" = None,
+    cells: "Cells | None" = None,
+) -> None:
+    """Write the report of one experiment as one self-contained HTML page.
+
+    Parameters
+    ----------
+    title
+        Heading of the page.
+    tracks
+        Trajectories, not smoothed.
+    observables
+        What `observe` made of them.
+    settings
+        How the results were made: the content of ``run.json`` (`RunRecord.as_dict`). Times and
+        machine are left out, so that equal results give an equal page.
+    out
+        The HTML file.
+    stack
+        The label masks, for a picture of the segmented frame.
+    raw
+        The recorded movie; the outlines of the cells are then drawn on it.
+    cells
+        The cells table, for the density of each frame and the faults of the masks.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    write_page(
+        build_report(
+            title=title,
+            tracks=tracks,
+            result=read_result(observables, name=title),
+            settings=settings,
+            stack=stack,
+            raw=raw,
+            cells=cells,
+        ),
+        out,
+    )
+
+
+def build_report(
+    *,
+    title: str,
+    tracks: "Tracks",
+    result: Result,
+    settings: Mapping[str, Any],
+    stack: "LabelStack | None" = None,
+    raw: "ImageStack | None" = None,
+    cells: "Cells | None" = None,
+) -> Page:
+    """Put the report of `experiment_report` together, without writing it."""
+    scalars = read_scalars(result)
+    sections = [
+        _section("layer", "The layer", _layer_figures(tracks, stack, raw, cells), _LAYER_TEXT),
+        _section("shape", "Shape of the cells", [panels.shape_figure([result])], _SHAPE_TEXT),
+        _section(
+            "motion",
+            "Motion and relaxation",
+            [
+                panels.paths_figure(tracks),
+                panels.scattering_figure([result]),
+                panels.msd_figure([result]),
+            ],
+            _MOTION_TEXT,
+        ),
+        _section("links", "Was the linking safe?", [panels.linking_figure(tracks)], _LINK_TEXT),
+    ]
+    faults = {} if cells is None else cells.faults
+    return Page(
+        title=title,
+        lede=_lede(tracks, result),
+        glance=headlines(scalars),
+        sections=(
+            Section("results", "Results", text=_RESULTS_TEXT, tables=(scalar_table(scalars),)),
+            *[section for section in sections if section is not None],
+            warnings_section(faults, settings, tracks.provenance, reasons(result)),
+            methods_section([("", settings)], tracks.provenance),
+        ),
+    )
+
+
+_RESULTS_TEXT = (
+    "Each value stands with its standard error. The error comes from the spread between "
+    "independent parts of this recording; it does not hold for other experiments. With one "
+    "recording there is one replicate, whatever the number of cells.",
+)
+_LAYER_TEXT = (
+    "What was segmented, and how many cells there were while it was filmed. A cell keeps its "
+    "colour as long as it keeps its track.",
+)
+_SHAPE_TEXT = (
+    "The shape index p = P/√A compares the outline of a cell with its area: 3.54 for a disc, "
+    "3.72 for a regular hexagon, larger for long or ragged cells.",
+)
+_MOTION_TEXT = (
+    "How far cells go, and how long the layer remembers where they were. F_{s}(q, t) falls from "
+    "1 to 0 as cells leave their places; the time at which it reaches 1/e is the relaxation time "
+    "τ_{α}.",
+)
+_LINK_TEXT = (
+    "Cells are followed safely when they move much less between frames than the distance to "
+    "their nearest neighbour. Where the two distributions overlap, links can be wrong.",
+)
+
+
+def _section(
+    name: str, title: str, figures: Sequence[Figure | None], text: tuple[str, ...]
+) -> Section | None:
+    shown = tuple(figure for figure in figures if figure is not None)
+    return Section(name, title, text=text, figures=shown) if shown else None
+
+
+def _layer_figures(
+    tracks: "Tracks",
+    stack: "LabelStack | None",
+    raw: "ImageStack | None",
+    cells: "Cells | None",
+) -> list[Figure | None]:
+    picture = None if stack is None else panels.masks_figure(stack, tracks, raw=raw)
+    return [picture, panels.density_figure(tracks, cells)]
+
+
+def _lede(tracks: "Tracks", result: Result) -> str:
+    frames = result.summary.get("n_frames", tracks.table["frame"].nunique())
+    length, time = pretty_unit(tracks.units.length), pretty_unit(tracks.units.time)
+    mean = result.summary.get("n_cells_mean")
+    count = f"{mean:.0f} cells in each of {frames} frames" if mean else f"{frames} frames"
+    return (
+        f"{count}, one every {tracks.frame_interval:g} {time}, followed as {tracks.n_tracks} "
+        f"tracks. Lengths are in {length}, times in {time}."
+    )
+
+
+def headlines(scalars: Sequence[Scalar]) -> tuple[Headline, ...]:
+    """The few scalars that a reader looks for first."""
+    known = {scalar.key: scalar for scalar in scalars}
+    return tuple(
+        Headline(known[key].label, scalar_text(known[key]), known[key].unit)
+        for key in _HEADLINES
+        if key in known
+    )
+
+
+def scalar_text(scalar: Scalar) -> str:
+    """Value and error, or the bound of a censored value."""
+    if not np.isfinite(scalar.value) and np.isfinite(scalar.censored_at):
+        return f"> {format_value(scalar.censored_at)}"
+    return format_value(scalar.value, scalar.std_error)
+
+
+def scalar_table(scalars: Sequence[Scalar]) -> Table:
+    """All scalars of one result, with unit, sample and rule; the CSV has full precision."""
+    import pandas as pd
+
+    return Table(
+        name="results",
+        caption="Value ± standard error.",
+        columns=("Quantity", "Value", "Unit", "Sample", "How it was obtained"),
+        classes=("", "number", "", "", "note"),
+        rows=tuple(
+            Row((s.label, scalar_text(s), s.unit, s.n, _censored_rule(s))) for s in scalars
+        ),
+        data=pd.DataFrame(
+            {
+                "quantity": [s.key for s in scalars],
+                "value": [s.value for s in scalars],
+                "std_error": [s.std_error for s in scalars],
+                "censored_at": [s.censored_at for s in scalars],
+                "unit": [s.unit.replace("_{", "").replace("{", "").replace("}", "")
+                         for s in scalars],
+                "sample": [s.n for s in scalars],
+            }
+        ),
+    )  # fmt: skip
+
+
+def _censored_rule(scalar: Scalar) -> str:
+    if np.isfinite(scalar.value) or not np.isfinite(scalar.censored_at):
+        return scalar.rule
+    return f"{scalar.rule}; the curve does not cross within the recording, so this is a bound"
+
+
+def warnings_section(
+    faults: Mapping[str, int],
+    settings: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    missing: Sequence[str],
+) -> Section:
+    """What a reader should know before trusting the numbers."""
+    points = [
+        f"{count} {_FAULTS.get(name, name.replace('_', ' '))}."
+        for name, count in faults.items()
+        if count
+    ]
+    for notes in (settings.get("notes"), provenance.get("notes"), provenance.get("warnings")):
+        if isinstance(notes, Sequence) and not isinstance(notes, str):
+            points += [str(note) for note in notes]
+    points += [f"Not measured: {reason}" for reason in missing]
+    text = () if points else ("Nothing was found that needs a warning.",)
+    return Section(
+        "warnings", "What to know about this recording", text, tuple(dict.fromkeys(points))
+    )
+
+
+def methods_section(
+    records: Sequence[tuple[str, Mapping[str, Any]]], provenance: Mapping[str, Any] | None = None
+) -> Section:
+    """Every setting, version, seed and input digest, and the commands that repeat the work."""
+    groups = []
+    commands = []
+    for name, record in records:
+        every = [*record.get("earlier", []), record]
+        for part in every:
+            settings = part.get("settings", {} if "command" in part else part)
+            label = f"{name}: " if name else ""
+            command = str(part.get("command", "analysis"))
+            if settings:
+                groups.append(Settings(f"{label}Settings of {command}", flatten(settings)))
+            inputs = part.get("inputs", {})
+            if inputs:
+                groups.append(
+                    Settings(f"{label}Inputs of {command} (SHA-256)", tuple(inputs.items()))
+                )
+            commands += command_lines(part)
+    if provenance:
+        kept = {k: v for k, v in provenance.items() if k not in {"notes", "warnings"}}
+        groups.append(Settings("How the tracks were made", flatten(kept)))
+    groups.append(Settings("Versions", _versions()))
+    return Section(
+        "methods",
+        "Methods",
+        text=("Everything needed to obtain the same numbers again.",),
+        settings=tuple(groups),
+        commands="\n".join(dict.fromkeys(commands)),
+    )
+
+
+def command_lines(record: Mapping[str, Any]) -> list[str]:
+    """The command line that repeats one recorded run, with the options that were set."""
+    import shlex
+
+    command = record.get("command")
+    settings = record.get("settings", {})
+    inputs = list(record.get("inputs", {}))
+    if command == "track" and inputs:
+        words = ["cellquant", "track", inputs[0], "-o", "RESULTS"]
+        if settings.get("raw"):
+            words += ["--raw", str(settings["raw"])]
+        if settings.get("length_unit") == "px":
+            words += ["--units", "pixel"]
+        else:
+            words += ["--pixel-size", f"{settings.get('pixel_size')}"]
+            words += ["--frame-interval", f"{settings.get('frame_interval')}"]
+        if settings.get("max_distance") is not None:
+            words += ["--max-distance", f"{settings['max_distance']}"]
+        if settings.get("divisions") is False:
+            words.append("--no-divisions")
+        if settings.get("linker", "cues") != "cues":
+            words += ["--linker", str(settings["linker"])]
+        return [shlex.join(words)]
+    if command == "observe":
+        words = ["cellquant", "observe", str(settings.get("source", "RESULTS")), "-o", "RESULTS"]
+        for name in settings.get("only") or ():
+            words += ["--only", str(name)]
+        return [shlex.join(words)]
+    if command in {"run", "simulate", "sweep", "demo"}:
+        words = ["cellquant", str(command)]
+        words += inputs[:1] if command in {"run", "sweep"} else []
+        if command == "demo":
+            words += ["--seed", str(settings.get("seed", 1))]
+        return [shlex.join([*words, "-o", "RESULTS"])]
+    return []
+
+
+def _versions() -> tuple[tuple[str, str], ...]:
+    libraries = []
+    for name in _LIBRARIES:
+        try:
+            libraries.append((name, metadata.version(name)))
+        except metadata.PackageNotFoundError:
+            continue
+    return (("cellquant", __version__), ("Python", platform.python_version()), *libraries)
+
+
+def tau_alpha_of(result: Result) -> tuple[float, float]:
+    """Relaxation time and its standard error; NaN where not measured."""
+    value = look_up(result.summary, "tau_alpha.value")
+    error = look_up(result.summary, "tau_alpha.std_error")
+    return (
+        float(value) if value is not None else np.nan,
+        float(error) if error is not None else np.nan,
+    )
