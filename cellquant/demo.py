@@ -31,7 +31,7 @@ def run_demo(out: str | Path, *, seed: int = 1, step: Step = silent) -> Path:
         If the output cannot be written.
     """
     from cellquant.compare.report import experiment_report
-    from cellquant.io import inspect_labels, read_images, read_labels
+    from cellquant.io import inspect_labels, read_labels
 
     folder = check_output(out)
     with as_file(files("cellquant") / "demo_data") as embedded:
@@ -42,7 +42,7 @@ def run_demo(out: str | Path, *, seed: int = 1, step: Step = silent) -> Path:
     with step("inspect") as progress:
         write_json(folder / "inspection.json", inspect_labels(masks, progress=progress).as_dict())
     cells, tracks, record = track_movie(masks, folder, step=step)
-    observables = observe_into(tracks, folder, record, options={"seed": seed}, step=step)
+    observables = observe_into(tracks, folder, record, step=step)
     record.command = "demo"
     record.settings = {**record.settings, "seed": seed}
     report = folder / "report.html"

@@ -1,6 +1,5 @@
 """From tracks, cells or a run to `summary.json` and one tidy table per observable."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from cellquant.errors import InputError
 from cellquant.observables import measures, relaxations
 from cellquant.observables.context import Context, Settings
 from cellquant.observables.measures import Measure, Results
+from cellquant.storage import atomic_path, write_json
 from cellquant.tables import Cells, Tracks, Units, write_table
 
 
@@ -70,11 +70,10 @@ class Observables:
             Made when it does not exist. Equal observables give byte-equal files.
         """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
         for name, table in self.tables.items():
-            write_table(table, folder / f"{name}.parquet", units=self.units)
-        text = json.dumps(self.summary, sort_keys=True, indent=1, allow_nan=False)
-        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+            with atomic_path(folder / f"{name}.parquet") as path:
+                write_table(table, path, units=self.units)
+        write_json(folder / "summary.json", self.summary)
 
 
 def available_observables() -> dict[str, str]:
