@@ -1,6 +1,8 @@
 """Movies in and out: TIFF stacks, folders of frames, tracking folders, calibration."""
 
 from cellquant.io.calibration import Calibration as Calibration
+from cellquant.io.inspect import Inspection as Inspection
+from cellquant.io.inspect import inspect_labels as inspect_labels
 from cellquant.io.stack import ImageStack as ImageStack
 from cellquant.io.stack import LabelStack as LabelStack
 from cellquant.io.stack import read_images as read_images
@@ -10,7 +12,9 @@ from cellquant.io.stack import write_labels as write_labels
 __all__ = [
     "Calibration",
     "ImageStack",
+    "Inspection",
     "LabelStack",
+    "inspect_labels",
     "read_images",
     "read_labels",
     "write_labels",

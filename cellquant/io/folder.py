@@ -24,6 +24,8 @@ _SUFFIXES = (".tif", ".tiff")
 _CTC_NAME = re.compile(r"(man_track|mask)\d+", re.IGNORECASE)
 _LINEAGES = ("man_track.txt", "res_track.txt")
 _PICKLES = (".npy", ".npz", ".pkl", ".pickle")
+# Names whose numbers span more than this many times the number of files count no frames.
+_MAX_SPAN = 1000
 # Regular steps in the numbering are only taken for a numbering habit from this many files on.
 _MIN_REGULAR = 3
 
@@ -141,6 +143,11 @@ def _open_files(folder: Path, files: Sequence[Path]) -> Movie:
     raw, notes = _numbers(folder, files)
     listed = any((folder / name).is_file() for name in _LINEAGES)
     numbers = raw if listed else _from_zero(raw, notes)
+    if numbers[-1] - numbers[0] >= _MAX_SPAN * len(files):
+        raise InputError(
+            f"{folder} has names such as {files[0].name} and {files[-1].name}, whose numbers are "
+            "too far apart to count frames; rename the files to frame numbers."
+        )
     _note_gaps(numbers, notes)
     first = open_tiff(files[0])
     dtype: np.dtype[Any] = first.dtype
