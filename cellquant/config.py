@@ -142,7 +142,7 @@ def _unique(what: str, names: list[Any]) -> None:
         raise ValueError(f"the {what} {', '.join(twice)} is given more than once; rename one")
 
 
-Config = TypeVar("Config", bound=_Strict)
+Config = TypeVar("Config", bound=BaseModel)
 
 
 def load(path: str | Path, model: type[Config]) -> Config:

@@ -151,14 +151,14 @@ def _observables(
 
     def lagged(value: np.ndarray, error: np.ndarray) -> pd.DataFrame:
         return pd.DataFrame(
-            {"lag_time": lag, "value": value, "std_error": error, "n_pairs": 500, "window": -1}
+            {"lag_time": lag, "value": value, "std_error": error, "n_pairs": 500, "scope": "all"}
         )
 
     tables = {
         "self_intermediate_scattering": lagged(scattering, 0.02 + 0 * lag),
         "msd": lagged(mobility, 0.05 * mobility),
         "shape_index": pd.DataFrame(
-            {"value": p, "density": density, "std_error": 0.05 * density, "n": 100}
+            {"shape_index": p, "value": density, "std_error": 0.05 * density, "n": 100}
         ),
         "van_hove": pd.DataFrame({"r": r, "value": hove, "std_error": 0.05 * hove}),
     }

@@ -108,7 +108,7 @@ def test_warnings_tell_faults_notes_and_what_was_not_measured(layer: Layer, tmp_
     assert "3 labels in several pieces" in warnings
     assert "hole" not in warnings
     assert "IDs are per frame." in warnings
-    assert "chi4 peak: fewer than 100 tracks" in warnings
+    assert "Chi4 peak: fewer than 100 tracks" in warnings
 
 
 def test_censored_relaxation_time_is_shown_as_a_bound(layer: Layer, tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def density_figure(tracks: "Tracks", cells: "Cells | None") -> Figure:
 def shape_figure(results: Sequence[Result], *, name: str = "shape-index") -> Figure | None:
     """P(p) with mean, median and mode (for a single result)."""
     curves = [
-        curve_of(r, "shape_index", x="value", y="density", series=i,
+        curve_of(r, "shape_index", x="shape_index", series=i,
                  kind="bars" if len(results) == 1 else "line")
         for i, r in enumerate(results)
     ]  # fmt: skip

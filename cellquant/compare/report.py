@@ -260,7 +260,7 @@ def warnings_section(
     for notes in (settings.get("notes"), provenance.get("notes"), provenance.get("warnings")):
         if isinstance(notes, Sequence) and not isinstance(notes, str):
             points += [str(note) for note in notes]
-    points += [f"Not measured: {reason}" for reason in missing]
+    points += missing
     text = () if points else ("Nothing was found that needs a warning.",)
     return Section(
         "warnings", "What to know about this recording", text, tuple(dict.fromkeys(points))

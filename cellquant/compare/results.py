@@ -233,7 +233,7 @@ def reasons(result: Result) -> list[str]:
     found = []
     for name, group in result.summary.items():
         if isinstance(group, Mapping) and isinstance(group.get("reason"), str):
-            found.append(f"{name.replace('_', ' ')}: {group['reason']}")
+            found.append(f"{name.replace('_', ' ').capitalize()}: {group['reason']}.")
     return found
 
 
@@ -300,7 +300,6 @@ def curve_of(
     table: str,
     *,
     x: str = "lag_time",
-    y: str = "value",
     series: int = 0,
     kind: str = "line",
     label: str | None = None,
@@ -312,22 +311,20 @@ def curve_of(
     result
         Where to look.
     table
-        Name of the observable; its table has columns `x`, `y`, std_error.
-    x, y
-        Columns of abscissa and ordinate.
+        Name of the observable; its table has columns `x`, value, std_error.
+    x
+        Column of the abscissa.
     """
     data = result.tables.get(table)
-    if data is None or data.empty or x not in data.columns or y not in data.columns:
+    if data is None or data.empty or x not in data.columns or "value" not in data.columns:
         return None
-    for column in ("window", "bin", "scope"):
-        if column in data.columns:
-            whole = data[column].isna() | data[column].isin(["all", -1])
-            data = data[whole] if whole.any() else data[data[column] == data[column].iloc[0]]
+    if "scope" in data.columns:
+        data = data[data["scope"] == "all"]
     error = data["std_error"].to_numpy(np.float64) if "std_error" in data.columns else None
     return Curve(
         label=result.name if label is None else label,
         x=data[x].to_numpy(np.float64),
-        y=data[y].to_numpy(np.float64),
+        y=data["value"].to_numpy(np.float64),
         error=error,
         series=series,
         kind=kind,
