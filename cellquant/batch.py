@@ -115,6 +115,7 @@ def task_folder(out: Path, task: Task) -> Path:
 
 def work_on_stack(task: Task) -> None:
     """Track and observe one stack, unless its finished result is there already."""
+    from cellquant.compare.report import experiment_report
     from cellquant.io import read_images, read_labels
     from cellquant.pipeline import observe_into, track_movie
 
@@ -130,10 +131,30 @@ def work_on_stack(task: Task) -> None:
         units="pixel" if calibration["units"] == "pixel" else None,
     )
     raw = None if task["raw"] is None else read_images(task["raw"])
-    _, tracks, record = track_movie(masks, folder, raw=raw, options=task["tracking"])
-    observe_into(tracks, folder, record, options=task["observables"])
+    cells, tracks, record = track_movie(masks, folder, raw=raw, options=task["tracking"])
+    observables = observe_into(
+        tracks,
+        folder,
+        record,
+        options={
+            **task["observables"],
+            "condition": task["condition"],
+            "trial": task["trial"],
+        },
+    )
     record.command = "run"
     record.settings = {name: value for name, value in task.items() if name != "folder"}
+    with record.stage("report"):
+        experiment_report(
+            title=f"{task['condition']}, {task['trial']}, {task['name']}",
+            tracks=tracks,
+            observables=observables,
+            settings=record.as_dict(),
+            out=folder / "report.html",
+            stack=masks,
+            raw=raw,
+            cells=cells,
+        )
     record.write(folder)
 
 
@@ -210,7 +231,7 @@ def run_experiment(
             from cellquant.study import write_study
 
             with record.stage("study"):
-                write_study(folder, config, finished)
+                write_study(folder, finished, record.as_dict())
         write_json(folder / "failures.json", failures)
         record.write(folder)
     return StudyOutcome(

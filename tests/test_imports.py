@@ -27,8 +27,7 @@ ALLOWED: dict[str, set[str]] = {
     "pipeline": FOUNDATION | {"observables", "segment", "track", "sim"},
     "study": FOUNDATION | {"observables", "statistics", "compare"},
     "batch": FOUNDATION
-    | {"observables", "segment", "track", "sim"}
-    | {"pipeline", "engines", "study"},
+    | {"observables", "segment", "track", "sim", "compare", "pipeline", "engines", "study"},
     "demo": FOUNDATION | {"observables", "segment", "track", "sim", "compare", "pipeline"},
 }
 FORBIDDEN = {"napari", "PyQt5", "PyQt6", "PySide2", "PySide6", "qtpy", "pickle", "shelve"}
