@@ -1,0 +1,125 @@
+"""Sparse optimal assignment of the cells of two frames, divisions included."""
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
+
+from cellquant.track.movie import FloatArray, IntArray
+
+# Beyond this many branches the best division set found so far is kept: a bound, not a tuning knob.
+BRANCH_LIMIT = 200
+
+
+def match(rows: IntArray, columns: IntArray, gains: FloatArray) -> IntArray:
+    """Choose links so that no cell has two and the summed gain is greatest.
+
+    Parameters
+    ----------
+    rows, columns
+        (E,) ends of the possible links; any integers.
+    gains
+        (E,) gain of each link over leaving both cells alone; links without gain are not chosen.
+
+    Returns
+    -------
+    numpy.ndarray
+        Indices of the chosen links, ascending.
+    """
+    useful = np.flatnonzero(gains > 0.0)
+    if useful.size == 0:
+        return useful
+    row_of, row = np.unique(rows[useful], return_inverse=True)
+    column_of, column = np.unique(columns[useful], return_inverse=True)
+    n, m = len(row_of), len(column_of)
+    # Every row also has a column of its own that means "no partner". Its cost is the same in all
+    # rows and above every gain, so that no stored entry is zero (zeros would be dropped).
+    top = float(gains[useful].max()) + 1.0
+    cost = csr_array(
+        (
+            np.concatenate((top - gains[useful], np.full(n, top))),
+            (np.concatenate((row, np.arange(n))), np.concatenate((column, m + np.arange(n)))),
+        ),
+        shape=(n, m + n),
+    )
+    matched_row, matched_column = min_weight_full_bipartite_matching(cost)
+    partner = np.full(n, -1)
+    partner[matched_row] = matched_column
+    chosen: IntArray = useful[partner[row] == column]
+    return chosen
+
+
+def match_with_divisions(
+    rows: IntArray,
+    columns: IntArray,
+    gains: FloatArray,
+    families: IntArray,
+    family_gains: FloatArray,
+) -> tuple[IntArray, IntArray]:
+    """Choose links and divisions together, so that no cell is used twice.
+
+    Parameters
+    ----------
+    rows, columns, gains
+        Possible links, as for `match`.
+    families
+        (D, 3) mother (a row) and two daughters (columns) of each possible division.
+    family_gains
+        (D,) gain of each over leaving the three cells alone.
+
+    Returns
+    -------
+    links : numpy.ndarray
+        Indices of the chosen links.
+    divisions : numpy.ndarray
+        Indices of the chosen divisions.
+
+    The part of the problem that a division can influence is a small integer program, the rest is
+    an assignment.
+    """
+    none = np.empty(0, dtype=np.int64)
+    if len(families) == 0:
+        return match(rows, columns, gains), none
+    row_of, row = np.unique(np.concatenate((rows, families[:, 0])), return_inverse=True)
+    column_of, column = np.unique(
+        np.concatenate((columns, families[:, 1], families[:, 2])), return_inverse=True
+    )
+    n, e, d = len(row_of), len(rows), len(families)
+    mother, daughters = row[e:], (column[e : e + d], column[e + d :])
+    size = n + len(column_of)
+    graph = coo_array(
+        (
+            np.ones(e + 2 * d),
+            (
+                np.concatenate((row[:e], mother, mother)),
+                n + np.concatenate((column[:e], *daughters)),
+            ),
+        ),
+        shape=(size, size),
+    )
+    _, component = connected_components(graph, directed=False)
+    divided = np.zeros(component.max() + 1, dtype=bool)
+    divided[component[mother]] = True
+    inside = np.flatnonzero(divided[component[row[:e]]] & (gains > 0.0))
+    outside = np.flatnonzero(~divided[component[row[:e]]])
+    alone = outside[match(rows[outside], columns[outside], gains[outside])]
+    cells = np.concatenate(
+        (row[inside], n + column[inside], mother, n + daughters[0], n + daughters[1])
+    )
+    option = np.arange(len(inside) + d)
+    options = np.concatenate((option[: len(inside)],) * 2 + (option[len(inside) :],) * 3)
+    used, constraint = np.unique(cells, return_inverse=True)
+    usage = csr_array((np.ones(len(cells)), (constraint, options)), shape=(len(used), len(option)))
+    solution = milp(
+        -np.concatenate((gains[inside], family_gains)),
+        integrality=np.ones(len(option)),
+        bounds=Bounds(0.0, 1.0),
+        constraints=LinearConstraint(usage, -np.inf, 1.0),
+        options={"node_limit": BRANCH_LIMIT},
+    )
+    if solution.x is None:
+        chosen = match(rows[inside], columns[inside], gains[inside])
+        return np.sort(np.concatenate((alone, inside[chosen]))), none
+    taken = solution.x > 0.5
+    links = np.sort(np.concatenate((alone, inside[taken[: len(inside)]])))
+    return links, np.flatnonzero(taken[len(inside) :])

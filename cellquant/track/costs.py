@@ -1,0 +1,360 @@
+"""What a link is worth: motion, shape, births and deaths, calibrated on the movie itself."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cellquant.track.kernels import neighbour_mean, pair_gains
+from cellquant.track.movie import NEAR, BoolArray, FloatArray, IntArray, Movie
+
+KINDS = 4  # no path, path after, path before, path on both sides
+TERMS = 7
+_TAILS = (2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
+_SHAPE_TAIL = 5.0
+_SHAPE_FLOOR = 0.05
+_PRIOR_LINKS = 10.0
+_PRIOR_SCALE = 0.15  # of the spacing
+_PRIOR_EVENTS = 2.0
+_PRIOR_RATE = 0.01
+_UNBORN = 0.2
+
+
+@dataclass(frozen=True)
+class Links:
+    """Who follows whom, as indices into all cells; -1 where nobody does.
+
+    ``after`` (N,) the next cell, ``second`` (N,) the other daughter of a division, ``before``
+    (N,) the previous cell or the mother, ``confidence`` (N,) of the link that ends in the cell.
+    """
+
+    after: IntArray
+    second: IntArray
+    before: IntArray
+    confidence: FloatArray
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Displacements per frame relative to the drift: of the cells and around them.
+
+    ``drift`` (P, 2) of each pair of frames; ``own_after``, ``own_before`` (N, 2) with
+    ``has_after``, ``has_before`` (N,); ``around_after`` and ``around_before`` (N, 2, 2) means
+    over the neighbours at two scales.
+    """
+
+    drift: FloatArray
+    own_after: FloatArray
+    own_before: FloatArray
+    has_after: IntArray
+    has_before: IntArray
+    around_after: FloatArray
+    around_before: FloatArray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Prediction of a displacement from the paths, and the scatter around it, per kind.
+
+    ``coefficients`` (4, 7) of: neighbours now near, neighbours now wide, neighbours before,
+    neighbours of the partner now, neighbours of the partner next, own step before, partner's
+    step next. ``scale`` (4,) and ``tail`` (4,) of the two-dimensional Student density.
+    """
+
+    coefficients: FloatArray
+    scale: FloatArray
+    tail: FloatArray
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """How much of a cell's shape survives a frame, against the spread in the population."""
+
+    typical: FloatArray
+    memory: FloatArray
+    link_precision: FloatArray
+    population_precision: FloatArray
+    constant: float
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Chance per cell and frame pair to vanish, to appear, to divide; inside and at the edge."""
+
+    vanish: tuple[float, float]
+    appear: tuple[float, float]
+    divide: float
+    counts: dict[str, int] = field(default_factory=dict)
+
+
+def paths(movie: Movie, links: Links | None, flow: FloatArray) -> Paths:
+    """Collect displacements from links, or from the flow where there are none yet."""
+    n = movie.n_cells
+    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
+    elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
+    drift = np.zeros((len(movie.time), 2))
+    per_frame = flow / elapsed[:, None]
+    own_after, own_before = np.zeros((n, 2)), np.zeros((n, 2))
+    has_after, has_before = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    if links is None:
+        weight = np.ones(n)
+        moved = per_frame.copy()
+    else:
+        single = np.flatnonzero((links.after >= 0) & (links.second < 0))
+        target = links.after[single]
+        moved = np.zeros((n, 2))
+        moved[single] = (movie.position[target] - movie.position[single]) / elapsed[single, None]
+        weight = np.zeros(n)
+        weight[single] = links.confidence[target]
+        has_after[single] = 1
+        has_before[target] = 1
+    for index in range(len(movie.time) - 1):
+        here = movie.cells_of(index)
+        used = weight[here] > 0.3
+        source = moved[here][used] if used.sum() >= 3 else per_frame[here]
+        drift[index] = np.median(source, axis=0)
+    relative = moved - drift[frames]
+    fallback = per_frame - drift[frames]
+    fallback[movie.start[-2] :] = 0.0
+    around_after = np.empty((n, 2, 2))
+    neighbour_mean(relative, weight, movie.neighbours, NEAR, fallback, 0.5, around_after)
+    around_before = np.zeros((n, 2, 2))
+    if links is None:
+        around_before = _carried(movie, flow, fallback)
+    else:
+        own_after[single] = relative[single]
+        own_before[target] = relative[single]
+        arrived = np.zeros(n)
+        arrived[target] = weight[single]
+        carried = _carried(movie, flow, fallback)[:, 0]
+        neighbour_mean(own_before, arrived, movie.neighbours, NEAR, carried, 0.5, around_before)
+    return Paths(drift, own_after, own_before, has_after, has_before, around_after, around_before)
+
+
+def _carried(movie: Movie, flow: FloatArray, fallback: FloatArray) -> FloatArray:
+    """Flow of the frame before, (N, 2, 2), at the cells that it brings nearest."""
+    from scipy.spatial import cKDTree
+
+    carried = np.zeros((movie.n_cells, 2, 2))
+    for index in range(len(movie.time) - 1):
+        a, b = movie.cells_of(index), movie.cells_of(index + 1)
+        _, nearest = cKDTree(movie.position[a] + flow[a]).query(movie.position[b])
+        carried[b] = fallback[a][nearest][:, None]
+    return carried
+
+
+def regressors(paths: Paths, source: IntArray, target: IntArray) -> FloatArray:
+    """The seven predictors (L, 7, 2) of the displacement from source to target."""
+    return np.stack(
+        (
+            paths.around_after[source, 0],
+            paths.around_after[source, 1],
+            paths.around_before[source, 0],
+            paths.around_before[target, 0],
+            paths.around_after[target, 0],
+            paths.own_before[source],
+            paths.own_after[target],
+        ),
+        axis=1,
+    )
+
+
+def first_motion(spacing: float) -> Motion:
+    """The motion model before anything is known: neighbours move alike."""
+    coefficients = np.zeros((KINDS, TERMS))
+    coefficients[:, 0] = 0.5
+    coefficients[:, 1] = 0.5
+    return Motion(coefficients, np.full(KINDS, _PRIOR_SCALE * spacing), np.full(KINDS, 4.0))
+
+
+def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Motion:
+    """Fit prediction and scatter to the links, robustly, each kind of path by itself."""
+    source = np.flatnonzero((links.after >= 0) & (links.second < 0))
+    target = links.after[source]
+    frames = np.searchsorted(movie.start, source, side="right") - 1
+    elapsed = (movie.time[frames + 1] - movie.time[frames]).astype(np.float64)
+    step = movie.position[target] - movie.position[source]
+    y = step / elapsed[:, None] - paths.drift[frames]
+    x = regressors(paths, source, target)
+    # A cell's own link is part of the neighbourhood of its neighbours only, never of its own.
+    weight = links.confidence[target] * np.sqrt(elapsed)
+    has_before, has_after = paths.has_before[source] == 1, paths.has_after[target] == 1
+    coefficients, scale, tail = before.coefficients.copy(), before.scale.copy(), before.tail.copy()
+    spacing = float(np.median(movie.spacing))
+    for kind in range(KINDS):
+        # Cells with a longer path are evidence for the poorer kinds too.
+        use = np.ones(len(source), dtype=bool)
+        terms = [0, 1, 2, 3, 4]
+        if kind & 2:
+            use &= has_before
+            terms.append(5)
+        if kind & 1:
+            use &= has_after
+            terms.append(6)
+        if use.sum() < 4 * TERMS:
+            continue
+        found = _student_fit(x[use][:, terms], y[use], weight[use], before.scale[kind], spacing)
+        coefficients[kind] = 0.0
+        coefficients[kind, terms], scale[kind], tail[kind] = found
+    return Motion(coefficients, scale, tail)
+
+
+def _student_fit(
+    x: FloatArray, y: FloatArray, weight: FloatArray, scale: float, spacing: float
+) -> tuple[FloatArray, float, float]:
+    """Regression with two-dimensional Student errors: coefficients, scale, degrees of freedom."""
+    terms = x.shape[1]
+    flat, goal = x.transpose(0, 2, 1).reshape(-1, terms), y.reshape(-1)
+    nu = 4.0
+    ridge = _PRIOR_LINKS * scale**2 * np.eye(terms) / (0.3 * spacing) ** 2
+    start = np.zeros(terms)
+    start[0] = start[1] = 0.5
+    coefficient = start
+    prior_scale = (_PRIOR_SCALE * spacing) ** 2
+    for _ in range(12):
+        r2 = np.sum((y - np.einsum("ltd,t->ld", x, coefficient)) ** 2, axis=1)
+        w = weight * (nu + 2.0) / (nu + r2 / scale**2)
+        w2 = np.repeat(w, 2)
+        normal = flat.T @ (w2[:, None] * flat) + ridge
+        coefficient = np.linalg.solve(normal, flat.T @ (w2 * goal) + ridge @ start)
+        r2 = np.sum((y - np.einsum("ltd,t->ld", x, coefficient)) ** 2, axis=1)
+        w = weight * (nu + 2.0) / (nu + r2 / scale**2)
+        total = weight.sum() + _PRIOR_LINKS
+        scale = float(np.sqrt((np.sum(w * r2) / 2 + _PRIOR_LINKS * prior_scale) / total))
+        scale = max(scale, 1e-3 * spacing)
+        likelihood = [np.sum(weight * -(v / 2 + 1) * np.log1p(r2 / (v * scale**2))) for v in _TAILS]
+        nu = _TAILS[int(np.argmax(likelihood))]
+    return coefficient, scale, nu
+
+
+def fit_shapes(movie: Movie, source: IntArray, target: IntArray, weight: FloatArray) -> Shapes:
+    """Fit the change of shape along links and the spread of shapes in the population."""
+    shape = movie.shape
+    f = shape.shape[1]
+    typical = np.median(shape, axis=0)
+    typical[1:3] = 0.0
+    centred = shape - typical
+    floor = _SHAPE_FLOOR**2 * np.eye(f)
+    population = _robust_covariance(centred, np.ones(len(shape))) + floor
+    if len(source) < 10 * f:
+        precision = np.asarray(np.linalg.inv(population), dtype=np.float64)
+        return Shapes(typical, np.zeros(f), precision, precision, 0.0)
+    a, b = centred[source], centred[target]
+    w = weight[:, None]
+    # Elongation is a vector: both components share one memory.
+    top, bottom = np.sum(w * a * b, axis=0), np.sum(w * a * a, axis=0) + len(source) * floor[0, 0]
+    top[1:3], bottom[1:3] = top[1:3].sum(), bottom[1:3].sum()
+    memory = np.clip(top / bottom, 0.0, 1.0)
+    change = _robust_covariance(b - memory * a, weight) + floor
+    link_precision = np.asarray(np.linalg.inv(change), dtype=np.float64)
+    population_precision = np.asarray(np.linalg.inv(population), dtype=np.float64)
+    constant = 0.5 * (np.linalg.slogdet(population)[1] - np.linalg.slogdet(change)[1])
+    return Shapes(typical, memory, link_precision, population_precision, float(constant))
+
+
+def _robust_covariance(values: FloatArray, weight: FloatArray) -> FloatArray:
+    f = values.shape[1]
+    covariance = np.diag(np.average(values**2, axis=0, weights=weight) + 1e-9)
+    for _ in range(6):
+        d = np.einsum("nf,fg,ng->n", values, np.linalg.inv(covariance), values)
+        w = weight * (_SHAPE_TAIL + f) / (_SHAPE_TAIL + d)
+        covariance = (w[:, None] * values).T @ values / weight.sum() + 1e-9 * np.eye(f)
+    return np.asarray(covariance, dtype=np.float64)
+
+
+def near_edge(movie: Movie, flow: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Which cells may leave through the edge before the next frame, or came in since the last."""
+    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
+    reach = 0.75 * movie.spacing[frames]
+    width, height = movie.field_of_view
+    ahead = movie.position + flow
+    back = movie.position.copy()
+    drift = np.array([flow[movie.cells_of(i)].mean(axis=0) for i in range(len(movie.time))])
+    back[movie.start[1] :] -= drift[frames[movie.start[1] :] - 1]
+
+    def margin(point: FloatArray) -> FloatArray:
+        x, y = point[:, 0], point[:, 1]
+        return np.asarray(np.minimum.reduce([x, y, width - x, height - y]), dtype=np.float64)
+
+    leaving = np.minimum(margin(ahead), movie.margin) < reach
+    entering = np.minimum(margin(back), movie.margin) < reach
+    return leaving, entering
+
+
+def fit_rates(movie: Movie, links: Links | None, leaving: BoolArray, entering: BoolArray) -> Rates:
+    """Chances to vanish, appear and divide from counts, each with a weak prior."""
+    if links is None:
+        return Rates((0.02, 0.2), (0.02, 0.2), 0.005)
+    last, first = movie.start[-2], movie.start[1]
+    gone = (links.after < 0)[:last]
+    new = (links.before < 0)[first:]
+    split = (links.second >= 0)[:last]
+
+    def rate(event: BoolArray, among: BoolArray) -> float:
+        count = float(np.sum(event & among)) + _PRIOR_EVENTS
+        return float(min(count / (among.sum() + _PRIOR_EVENTS / _PRIOR_RATE), 0.5))
+
+    return Rates(
+        (rate(gone, ~leaving[:last]), rate(gone, leaving[:last])),
+        (rate(new, ~entering[first:]), rate(new, entering[first:])),
+        rate(split, np.ones(len(split), dtype=bool)),
+    )
+
+
+def suppose_divisions(rates: Rates) -> Rates:
+    """Rates for the first look for divisions: what appeared inside was mostly born there."""
+    born = rates.appear[0]
+    return Rates(rates.vanish, (_UNBORN * born, rates.appear[1]), born)
+
+
+def gains(
+    movie: Movie,
+    candidates: IntArray,
+    paths: Paths,
+    motion: Motion,
+    shapes: Shapes,
+    rates: Rates,
+    leaving: BoolArray,
+    entering: BoolArray,
+    max_distance: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Log odds (N, K) of the candidate links; log of vanishing (N,) and of appearing (N,)."""
+    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
+    elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
+    vanish = np.where(leaving, rates.vanish[1], rates.vanish[0])
+    appear = np.where(entering, rates.appear[1], rates.appear[0])
+    stay = np.log(np.maximum(1.0 - vanish - rates.divide, 0.1))
+    leave = np.log(vanish)
+    arrive = np.log(appear * movie.density)
+    gain = np.empty(candidates.shape)
+    around = np.stack(
+        (paths.around_after[:, 0], paths.around_after[:, 1], paths.around_before[:, 0]), axis=1
+    )
+    around_target = np.stack((paths.around_before[:, 0], paths.around_after[:, 0]), axis=1)
+    pair_gains(
+        movie.position,
+        movie.shape,
+        candidates,
+        elapsed,
+        paths.own_before,
+        paths.own_after,
+        paths.has_before,
+        paths.has_after,
+        np.ascontiguousarray(around),
+        paths.drift[frames],
+        np.ascontiguousarray(around_target),
+        motion.coefficients,
+        motion.scale,
+        motion.tail,
+        shapes.typical,
+        shapes.memory,
+        shapes.link_precision,
+        shapes.population_precision,
+        shapes.constant,
+        _SHAPE_TAIL,
+        stay,
+        leave,
+        arrive,
+        max_distance,
+        gain,
+    )
+    return gain, leave, arrive

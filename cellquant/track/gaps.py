@@ -1,0 +1,106 @@
+"""Gaps: cells that were missed for a few frames, joined by a global pass over the ends."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cellquant.track.assign import match
+from cellquant.track.costs import Shapes
+from cellquant.track.movie import FloatArray, IntArray, Movie
+from cellquant.track.solve import Solution
+
+_NEAREST = 6
+_PRIOR_MISSED = 0.002
+_ROUNDS = 3
+
+
+def close_gaps(
+    movie: Movie,
+    solution: Solution,
+    *,
+    max_gap: int,
+    max_distance: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Join ends to starts that lie up to `max_gap` missing frames apart.
+
+    The place is extrapolated with the local flow, its scatter grows as the square root of time,
+    and the chance to miss a cell is learned from how many gaps there are: a movie without gaps
+    convinces itself that there are none.
+
+    Returns
+    -------
+    end, start : numpy.ndarray
+        Cells before and after each gap.
+    confidence : numpy.ndarray
+        Probability of each join against the two ends being strangers.
+    """
+    source, target, odds = _candidates(movie, solution, max_gap, max_distance)
+    missed = _PRIOR_MISSED
+    chosen = np.empty(0, dtype=np.int64)
+    total = odds + np.log(missed)
+    for _ in range(_ROUNDS):
+        total = odds + np.log(missed)
+        chosen = match(source, target, total)
+        missed = (len(chosen) + 1.0) / (movie.n_cells + 1.0 / _PRIOR_MISSED)
+    return source[chosen], target[chosen], 1.0 / (1.0 + np.exp(-np.minimum(total[chosen], 50.0)))
+
+
+def _candidates(
+    movie: Movie, solution: Solution, max_gap: int, max_distance: float
+) -> tuple[IntArray, IntArray, FloatArray]:
+    links, motion, shapes, flow = (solution.links, solution.motion, solution.shapes, solution.flow)
+    ends_all = np.flatnonzero(links.after < 0)
+    starts_all = np.flatnonzero(links.before < 0)
+    sources: list[IntArray] = []
+    targets: list[IntArray] = []
+    values: list[FloatArray] = []
+    n_frames = len(movie.time)
+    frame_of = np.searchsorted(movie.start, np.arange(movie.n_cells), side="right") - 1
+    for index in range(n_frames - 2):
+        ends = ends_all[frame_of[ends_all] == index]
+        if len(ends) == 0:
+            continue
+        place = movie.position[ends] + flow[ends]
+        for later in range(index + 2, n_frames):
+            span = float(movie.time[later] - movie.time[index])
+            if span > max_gap + 1:
+                break
+            # The flow of the missing frame, read where the cell would be.
+            bridge = movie.cells_of(later - 1)
+            _, nearest = cKDTree(movie.position[bridge]).query(place)
+            place = place + flow[bridge][nearest]
+            starts = starts_all[frame_of[starts_all] == later]
+            if len(starts) == 0:
+                continue
+            k = min(_NEAREST, len(starts))
+            _, found = cKDTree(movie.position[starts]).query(place, k)
+            row = np.repeat(np.arange(len(ends)), k)
+            column = found.reshape(-1)
+            a, b = ends[row], starts[column]
+            away = movie.position[b] - place[row]
+            raw = np.hypot(*(movie.position[b] - movie.position[a]).T)
+            width = motion.scale[0] * span
+            nu = motion.tail[0]
+            value = -np.log(2 * np.pi * width**2)
+            value = value - (nu / 2 + 1) * np.log1p(np.sum(away**2, axis=1) / (nu * width**2))
+            value += shape_odds(movie, shapes, a, b) - solution.leave[a] - solution.appear[b]
+            value[raw > max_distance * span] = -np.inf
+            sources.append(a)
+            targets.append(b)
+            values.append(value)
+    if not sources:
+        none = np.empty(0, dtype=np.int64)
+        return none, none, np.empty(0)
+    return np.concatenate(sources), np.concatenate(targets), np.concatenate(values)
+
+
+def shape_odds(movie: Movie, shapes: Shapes, source: IntArray, target: IntArray) -> FloatArray:
+    """Log odds (L,) that the shapes belong to one cell rather than to two."""
+    a, b = movie.shape[source] - shapes.typical, movie.shape[target] - shapes.typical
+    change = b - shapes.memory * a
+    near = np.einsum("nf,fg,ng->n", change, shapes.link_precision, change)
+    far = np.einsum("nf,fg,ng->n", b, shapes.population_precision, b)
+    tail = 5.0
+    odds: FloatArray = shapes.constant - (tail + b.shape[1]) / 2 * (
+        np.log1p(near / tail) - np.log1p(far / tail)
+    )
+    return odds

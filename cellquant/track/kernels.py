@@ -1,0 +1,310 @@
+"""Compiled loops of the tracker; they inline each other and stay in one file."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+
+@njit(cache=True)
+def soft_flow(
+    here: FloatArray,
+    there: FloatArray,
+    candidates: IntArray,
+    neighbours: IntArray,
+    flow: FloatArray,
+    widths: FloatArray,
+    rounds: IntArray,
+    outlier: float,
+) -> float:
+    """Move `flow` (n, 2) onto the next frame by soft assignment with shrinking width.
+
+    Each cell spreads its weight over the candidates as ``exp(-d^2 / 2 width^2)``, divided by what
+    competes for the same cell in either frame; its mean displacement is then averaged over its
+    neighbours. Returns the mean weight that found a partner.
+    """
+    n, k = candidates.shape
+    weight = np.zeros((n, k))
+    column = np.zeros(len(there))
+    row = np.zeros(n)
+    moved = np.zeros((n, 3))
+    averaged = np.zeros((n, 3))
+    matched = 0.0
+    for step in range(len(widths)):
+        scale = -0.5 / widths[step] ** 2
+        column[:] = 0.0
+        row[:] = 0.0
+        for i in range(n):
+            for c in range(k):
+                j = candidates[i, c]
+                dx = there[j, 0] - here[i, 0] - flow[i, 0]
+                dy = there[j, 1] - here[i, 1] - flow[i, 1]
+                exponent = scale * (dx * dx + dy * dy)
+                w = np.exp(exponent) if exponent > -12.0 else 0.0
+                weight[i, c] = w
+                row[i] += w
+                column[j] += w
+        matched = 0.0
+        for i in range(n):
+            mx = my = mass = 0.0
+            for c in range(k):
+                if weight[i, c] == 0.0:
+                    continue
+                j = candidates[i, c]
+                w = weight[i, c] / (outlier + max(row[i], column[j]))
+                mass += w
+                mx += w * (there[j, 0] - here[i, 0])
+                my += w * (there[j, 1] - here[i, 1])
+            moved[i, 0], moved[i, 1], moved[i, 2] = mx, my, mass
+            matched += mass
+        for _ in range(rounds[step]):
+            for i in range(n):
+                for d in range(3):
+                    averaged[i, d] = moved[i, d]
+                for c in range(neighbours.shape[1]):
+                    j = neighbours[i, c]
+                    for d in range(3):
+                        averaged[i, d] += moved[j, d]
+            moved, averaged = averaged, moved
+        for i in range(n):
+            if moved[i, 2] > 1e-9:
+                flow[i, 0] = moved[i, 0] / moved[i, 2]
+                flow[i, 1] = moved[i, 1] / moved[i, 2]
+    return float(matched / max(n, 1))
+
+
+@njit(cache=True)
+def neighbour_mean(
+    displacement: FloatArray,
+    weight: FloatArray,
+    neighbours: IntArray,
+    near: int,
+    fallback: FloatArray,
+    prior: float,
+    out: FloatArray,
+) -> None:
+    """Weighted mean displacement of the neighbours at two scales, out (n, 2, 2).
+
+    Each mean carries `prior` weight of the fallback, which alone decides where no neighbour has a
+    displacement.
+    """
+    n, m = neighbours.shape
+    for i in range(n):
+        x = y = 0.0
+        mass = 0.0
+        for scale in range(2):
+            first = 0 if scale == 0 else near
+            last = near if scale == 0 else m
+            for c in range(first, last):
+                j = neighbours[i, c]
+                if j == i:
+                    continue
+                w = weight[j]
+                mass += w
+                x += w * displacement[j, 0]
+                y += w * displacement[j, 1]
+            out[i, scale, 0] = (x + prior * fallback[i, 0]) / (mass + prior)
+            out[i, scale, 1] = (y + prior * fallback[i, 1]) / (mass + prior)
+
+
+@njit(cache=True)
+def marginals(
+    gain: FloatArray, candidates: IntArray, n_columns: int, rounds: int, out: FloatArray
+) -> None:
+    """Probability of every candidate link by belief propagation, out (n, k).
+
+    ``exp(gain)`` is the odds of a link against neither cell having a partner; candidates below 0
+    are none. Exact where the candidate graph is a tree, and close to it elsewhere.
+    """
+    n, k = candidates.shape
+    # Gains beyond this change no probability, but their sums would swallow the 1 of "no partner".
+    limit = 25.0
+    odds = np.zeros((n, k))
+    from_column = np.ones((n, k))
+    from_row = np.ones((n, k))
+    for i in range(n):
+        for c in range(k):
+            if candidates[i, c] >= 0:
+                odds[i, c] = np.exp(min(max(gain[i, c], -2 * limit), limit))
+    total_column = np.empty(n_columns)
+    for _ in range(rounds):
+        total_column[:] = 1.0
+        for i in range(n):
+            total = 1.0
+            for c in range(k):
+                total += odds[i, c] * from_column[i, c]
+            for c in range(k):
+                from_row[i, c] = 1.0 / max(total - odds[i, c] * from_column[i, c], 1.0)
+                if candidates[i, c] >= 0:
+                    total_column[candidates[i, c]] += odds[i, c] * from_row[i, c]
+        for i in range(n):
+            for c in range(k):
+                if candidates[i, c] >= 0:
+                    rest = total_column[candidates[i, c]] - odds[i, c] * from_row[i, c]
+                    from_column[i, c] = 1.0 / max(rest, 1.0)
+    for i in range(n):
+        for c in range(k):
+            belief = odds[i, c] * from_row[i, c] * from_column[i, c]
+            out[i, c] = belief / (1.0 + belief)
+
+
+@njit(cache=True)
+def pair_gains(
+    position: FloatArray,
+    shape: FloatArray,
+    candidates: IntArray,
+    elapsed: FloatArray,
+    own_before: FloatArray,
+    own_after: FloatArray,
+    has_before: IntArray,
+    has_after: IntArray,
+    around: FloatArray,
+    drift: FloatArray,
+    around_after: FloatArray,
+    coefficients: FloatArray,
+    scale: FloatArray,
+    tail: FloatArray,
+    typical: FloatArray,
+    memory: FloatArray,
+    link_precision: FloatArray,
+    population_precision: FloatArray,
+    shape_constant: float,
+    shape_tail: float,
+    stay: FloatArray,
+    leave: FloatArray,
+    appear: FloatArray,
+    max_distance: float,
+    gain: FloatArray,
+) -> None:
+    """Log odds of every candidate link against death of one cell and birth of the other.
+
+    gain (N, K); candidates (N, K) with -1 where there is none. The residual of the displacement
+    from its prediction has a two-dimensional Student density; so has the change of shape, against
+    the density of shapes in the population.
+    """
+    n, k = candidates.shape
+    f = shape.shape[1]
+    delta = np.empty(f)
+    for i in range(n):
+        for c in range(k):
+            j = candidates[i, c]
+            if j < 0:
+                gain[i, c] = -np.inf
+                continue
+            dx = position[j, 0] - position[i, 0]
+            dy = position[j, 1] - position[i, 1]
+            if dx * dx + dy * dy > max_distance * max_distance:
+                gain[i, c] = -np.inf
+                continue
+            kind = 2 * has_before[i] + has_after[j]
+            rx = dx / elapsed[i] - drift[i, 0]
+            ry = dy / elapsed[i] - drift[i, 1]
+            b = coefficients[kind]
+            for d in range(3):
+                rx -= b[d] * around[i, d, 0]
+                ry -= b[d] * around[i, d, 1]
+            for d in range(2):
+                rx -= b[3 + d] * around_after[j, d, 0]
+                ry -= b[3 + d] * around_after[j, d, 1]
+            if has_before[i]:
+                rx -= b[5] * own_before[i, 0]
+                ry -= b[5] * own_before[i, 1]
+            if has_after[j]:
+                rx -= b[6] * own_after[j, 0]
+                ry -= b[6] * own_after[j, 1]
+            width = scale[kind] * np.sqrt(elapsed[i])
+            nu = tail[kind]
+            distance = (rx * rx + ry * ry) * elapsed[i] * elapsed[i] / (width * width * nu)
+            value = -np.log(2 * np.pi * width * width) - (nu / 2 + 1) * np.log1p(distance)
+            near = 0.0
+            far = 0.0
+            for d in range(f):
+                delta[d] = shape[j, d] - typical[d] - memory[d] * (shape[i, d] - typical[d])
+            for d in range(f):
+                for e in range(f):
+                    near += delta[d] * link_precision[d, e] * delta[e]
+                    far += (
+                        (shape[j, d] - typical[d])
+                        * population_precision[d, e]
+                        * (shape[j, e] - typical[e])
+                    )
+            half = (shape_tail + f) / 2
+            value += shape_constant
+            value -= half * (np.log1p(near / shape_tail) - np.log1p(far / shape_tail))
+            gain[i, c] = value + stay[i] - leave[i] - appear[j]
+
+
+@njit(cache=True)
+def division_gains(
+    position: FloatArray,
+    log_area: FloatArray,
+    candidates: IntArray,
+    orphan: IntArray,
+    middle: FloatArray,
+    width: FloatArray,
+    tail: float,
+    separation: FloatArray,
+    ratios: FloatArray,
+    population: FloatArray,
+    mother: FloatArray,
+    prior: FloatArray,
+    leave: FloatArray,
+    appear: FloatArray,
+    first: int,
+    last: int,
+    out_cells: IntArray,
+    out_gain: FloatArray,
+) -> int:
+    """Log odds of divisions with at least one daughter that has no sure mother; their number.
+
+    The middle of the daughters stays near the predicted place (Student density), their distance
+    is log-normal, the sum of their areas against the mother's and their ratio are log-normal.
+    Writes (mother, daughter, daughter) into out_cells, as many as fit.
+    """
+    k = candidates.shape[1]
+    found = 0
+    for i in range(first, last):
+        for c in range(k):
+            j = candidates[i, c]
+            if j < 0 or not orphan[j]:
+                continue
+            for d in range(k):
+                h = candidates[i, d]
+                if h < 0 or h == j or (orphan[h] and h < j):
+                    continue
+                dx = position[h, 0] - position[j, 0]
+                dy = position[h, 1] - position[j, 1]
+                apart = np.sqrt(dx * dx + dy * dy)
+                if apart <= 0.0:
+                    continue
+                mx = (position[h, 0] + position[j, 0]) / 2 - middle[i, 0]
+                my = (position[h, 1] + position[j, 1]) / 2 - middle[i, 1]
+                w = width[i]
+                value = -np.log(2 * np.pi * w * w)
+                value -= (tail / 2 + 1) * np.log1p((mx * mx + my * my) / (w * w * tail))
+                z = (np.log(apart) - separation[0]) / separation[1]
+                value -= 0.5 * z * z + np.log(separation[1] * np.sqrt(2 * np.pi))
+                value -= np.log(2 * np.pi * apart * apart)
+                both = np.log(np.exp(log_area[j]) + np.exp(log_area[h])) - log_area[i]
+                z = (both - ratios[0]) / ratios[1]
+                value -= 0.5 * z * z + np.log(ratios[1] * np.sqrt(2 * np.pi))
+                z = (log_area[j] - log_area[h]) / ratios[2]
+                value -= 0.5 * z * z + np.log(ratios[2] * np.sqrt(2 * np.pi))
+                for g in (j, h):
+                    z = (log_area[g] - population[0]) / population[1]
+                    value += 0.5 * z * z + np.log(population[1] * np.sqrt(2 * np.pi))
+                z = (log_area[i] - population[0]) / population[1]
+                value += 0.5 * z * z + np.log(population[1] * np.sqrt(2 * np.pi))
+                z = (log_area[i] - mother[0]) / mother[1]
+                value -= 0.5 * z * z + np.log(mother[1] * np.sqrt(2 * np.pi))
+                value += prior[i] - leave[i] - appear[j] - appear[h]
+                if value > 0.0 and found < len(out_gain):
+                    out_cells[found, 0] = i
+                    out_cells[found, 1] = j
+                    out_cells[found, 2] = h
+                    out_gain[found] = value
+                    found += 1
+    return found

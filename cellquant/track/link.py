@@ -1,0 +1,215 @@
+"""Cells to tracks: the public entries, and what they report."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from cellquant.errors import InputError
+from cellquant.tables import TRACK_COLUMNS, Cells, Tracks
+from cellquant.track.baseline import trackpy_links
+from cellquant.track.diagnostics import describe
+from cellquant.track.gaps import close_gaps
+from cellquant.track.movie import FloatArray, IntArray, flatten
+from cellquant.track.solve import solve
+
+if TYPE_CHECKING:
+    from cellquant.io import ImageStack, LabelStack
+
+Linker = Literal["cues", "trackpy"]
+Progress = Callable[[int, int], None]
+
+
+def track(
+    stack: "LabelStack",
+    *,
+    raw: "ImageStack | None" = None,
+    max_distance: float | None = None,
+    divisions: bool = True,
+    linker: Linker = "cues",
+    max_gap: int = 2,
+    progress: Progress | None = None,
+) -> Tracks:
+    """Link the cells of label masks into trajectories; the masks are never altered.
+
+    Measures the cells of `stack` and passes them to `track_cells`, where the options are
+    described.
+
+    Parameters
+    ----------
+    stack
+        Label masks with a calibration, one integer per cell; IDs need not run through time.
+    raw, max_distance, divisions, linker, max_gap, progress
+        See `track_cells`.
+
+    Returns
+    -------
+    Tracks
+    """
+    from cellquant.segment import measure_cells
+
+    return track_cells(
+        measure_cells(stack),
+        stack,
+        raw=raw,
+        max_distance=max_distance,
+        divisions=divisions,
+        linker=linker,
+        max_gap=max_gap,
+        progress=progress,
+    )
+
+
+def track_cells(
+    cells: Cells,
+    masks: "LabelStack | None" = None,
+    *,
+    raw: "ImageStack | None" = None,
+    max_distance: float | None = None,
+    divisions: bool = True,
+    linker: Linker = "cues",
+    max_gap: int = 2,
+    progress: Progress | None = None,
+) -> Tracks:
+    """Link measured cells into trajectories.
+
+    Every link is worth ``ln[(1 - p_vanish) p(step) p(shape) / (p_vanish q_appear)]``: the odds of
+    one cell seen twice against two strangers. The step is predicted from the drift, the
+    neighbours' motion and the cell's own path; all scales, rates and weights are estimated from
+    the movie itself.
+
+    Parameters
+    ----------
+    cells
+        Measured cells, rows by frame and label.
+    masks
+        The label masks that were measured. Not needed for linking by centroid and moments.
+    raw
+        The recorded movie, frame by frame the same as `masks`; adds image correlation.
+    max_distance
+        Longest displacement between successive frames, in ``cells.units.length``. Chosen from
+        the data when None; give a value to forbid what is physically impossible.
+    divisions
+        Look for divisions; without them a track never has a parent.
+    linker
+        ``"cues"``, or ``"trackpy"`` for nearest neighbours alone (needs no shapes, finds no
+        divisions).
+    max_gap
+        Frames that a cell may be missing and still be followed.
+    progress
+        Called with the number of steps done and of all steps.
+
+    Returns
+    -------
+    Tracks
+        With the further column ``link_confidence``: probability that the row belongs to the same
+        cell as the row before, or to the mother for the first row of a daughter; NaN where a
+        track begins without a mother.
+
+    Raises
+    ------
+    InputError
+        If fewer than two frames hold cells.
+    """
+    if max_distance is not None and not max_distance > 0:
+        raise InputError(
+            f"max_distance must be > 0 {cells.units.length}, got {max_distance}; "
+            "leave it out to have it chosen from the data."
+        )
+    if max_gap < 0:
+        raise InputError(f"max_gap must be >= 0 frames, got {max_gap}.")
+    if linker not in ("cues", "trackpy"):
+        raise InputError(f"linker must be 'cues' or 'trackpy', got {linker!r}.")
+    if cells.n_frames < 2:
+        raise InputError(
+            f"tracking needs at least two frames, got {cells.n_frames}; "
+            "for shapes alone observe the masks directly."
+        )
+    if cells.table.empty:
+        raise InputError(
+            f"none of the {cells.n_frames} frames holds a cell; "
+            "check that these are label masks and not the raw movie."
+        )
+    movie = flatten(cells)
+    after = np.full(movie.n_cells, -1, dtype=np.int64)
+    second, confidence = after.copy(), np.full(movie.n_cells, np.nan)
+    report: dict[str, Any]
+    if len(movie.time) < 2:
+        report = {"divisions": 0, "gaps_closed": 0, "warnings": ["only one frame holds cells"]}
+    elif linker == "trackpy":
+        after, report = trackpy_links(movie, max_distance=max_distance, max_gap=max_gap)
+    else:
+        solution = solve(
+            movie,
+            divisions=divisions,
+            max_distance=np.inf if max_distance is None else max_distance,
+            progress=progress,
+        )
+        after, second = solution.links.after.copy(), solution.links.second
+        linked = solution.links.before >= 0
+        confidence[linked] = solution.links.confidence[linked]
+        end, start, sure = close_gaps(
+            movie,
+            solution,
+            max_gap=max_gap,
+            max_distance=np.inf if max_distance is None else max_distance,
+        )
+        after[end], confidence[start] = start, sure
+        report = describe(movie, solution, cells.units.length, n_gaps=len(end))
+    report["settings"] = {
+        "linker": linker,
+        "max_distance": max_distance,
+        "divisions": divisions,
+        "max_gap": max_gap,
+    }
+    track_id, parent = number_tracks(after, second)
+    return Tracks(
+        table=_table(cells, track_id, parent, confidence),
+        units=cells.units,
+        frame_interval=cells.frame_interval,
+        area=float(np.mean(cells.occupied_area)),
+        provenance=report,
+    )
+
+
+def number_tracks(after: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:
+    """Give every cell the number of its track and of its parent track, (N,) each.
+
+    Tracks are numbered from 1 in the order of their first cells; a division ends the mother's
+    track. A link always points to a later cell.
+    """
+    n = len(after)
+    track_id = np.zeros(n, dtype=np.int64)
+    parent_of = np.zeros(n + 1, dtype=np.int64)
+    mother = np.zeros(n, dtype=np.int64)
+    count = 0
+    for cell in range(n):
+        if track_id[cell] == 0:
+            count += 1
+            track_id[cell] = count
+            parent_of[count] = mother[cell]
+        if after[cell] < 0:
+            continue
+        if second[cell] >= 0:
+            mother[after[cell]] = mother[second[cell]] = track_id[cell]
+        else:
+            track_id[after[cell]] = track_id[cell]
+    return track_id, parent_of[track_id]
+
+
+def _table(
+    cells: Cells, track_id: IntArray, parent: IntArray, confidence: FloatArray
+) -> pd.DataFrame:
+    table = cells.table.assign(
+        track_id=track_id,
+        parent_track_id=parent,
+        time=cells.table["frame"] * cells.frame_interval,
+        link_confidence=confidence,
+    )
+    table = table.astype({**TRACK_COLUMNS, "link_confidence": "float64"})
+    order = np.lexsort((table["frame"].to_numpy(), table["track_id"].to_numpy()))
+    return table.iloc[order].reset_index(drop=True)
+
+
+__all__ = ["Linker", "number_tracks", "track", "track_cells"]
