@@ -263,3 +263,10 @@ class Context:
         from cellquant.observables.fits import fit_stretched_exponential
 
         return fit_stretched_exponential(self.whole_scattering)
+
+    @cached_property
+    def bonds(self) -> Any:
+        """Hexatic order and neighbour numbers."""
+        from cellquant.observables.bonds import bond_order
+
+        return bond_order(self.source, max_frames=self.settings.max_frames)

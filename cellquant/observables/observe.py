@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from cellquant.errors import InputError
-from cellquant.observables import measures, relaxations
+from cellquant.observables import fields, measures, relaxations
 from cellquant.observables.context import Context, Settings
 from cellquant.observables.measures import Measure, Results
 from cellquant.storage import atomic_path, write_json
@@ -39,6 +39,18 @@ _CATALOGUE: dict[str, _Entry] = {
     ),
     "overlap": _Entry("self-overlap Q(t)", True, measures.overlap),
     "chi4": _Entry("four-point susceptibility", True, measures.chi4),
+    "van_hove": _Entry("G_s(r, t) with core and tail", True, fields.van_hove),
+    "velocity_autocorrelation": _Entry(
+        "<v(s) . v(s + t)> and the persistence time", True, fields.velocity_autocorrelation
+    ),
+    "velocity_correlation": _Entry(
+        "<v_i . v_j> against distance", True, fields.velocity_correlation
+    ),
+    "cage_relative": _Entry("MSD and F_s relative to the neighbours", True, fields.cage_relative),
+    "structure_factor": _Entry("S(q) and its first peak", False, fields.structure_factor),
+    "pair_correlation": _Entry("g(r)", False, fields.pair_correlation),
+    "hexatic_order": _Entry("psi_6", False, fields.hexatic_order),
+    "neighbours": _Entry("number of Delaunay neighbours", False, fields.neighbours),
 }
 
 

@@ -72,14 +72,15 @@ def tau_alpha(context: Context, out: Results) -> None:
             "value": None, "std_error": None, "censored_at": None, "reason": reason,
         }  # fmt: skip
         return
-    out.summary["tau_alpha"] = _time_entry(context.tau)
+    out.summary["tau_alpha"] = time_entry(context.tau)
     out.summary["tau_alpha"]["stretched_exponential"] = context.stretched.as_dict()
     out.summary["tau_alpha"]["std_error_method"] = (
         "bootstrap over blocks: " + context.whole_scattering.method.removeprefix("jackknife over ")
     )
 
 
-def _time_entry(tau: Any) -> dict[str, Any]:
+def time_entry(tau: Any) -> dict[str, Any]:
+    """Summary entry of a relaxation time."""
     entry = {
         "value": tau.value,
         "std_error": tau.std_error,
@@ -123,7 +124,7 @@ def windows(context: Context, out: Results) -> None:
             entry.update(tau_alpha=None, tau_alpha_std_error=None, censored_at=None, reason=reason)
         else:
             average = context.scattering(entry["q"], window)
-            tau = _time_entry(relaxation_time(average))
+            tau = time_entry(relaxation_time(average))
             entry["tau_alpha"] = tau.pop("value")
             entry["tau_alpha_std_error"] = tau.pop("std_error")
             entry.update(tau, n_pairs=int(average.counts.sum()))

@@ -31,6 +31,8 @@ class Trajectories:
         (n_tracks + 1,) first entry of each track.
     first_frame
         (n_tracks,) frame number of each track's first entry, relative to ``origin_frame``.
+    start
+        (n_tracks, 2) first position of each track, unwrapped; ``x`` and ``y`` are relative to it.
     centre
         (n_tracks, 2) mean position of each track, unwrapped.
     origin_frame
@@ -48,6 +50,7 @@ class Trajectories:
     valid: BoolArray
     offsets: IntArray
     first_frame: IntArray
+    start: FloatArray
     centre: FloatArray
     origin_frame: int
     n_frames: int
@@ -119,6 +122,7 @@ def _from_rows(table: pd.DataFrame, tracks: Tracks) -> Trajectories:
         valid=valid,
         offsets=offsets,
         first_frame=first - origin,
+        start=np.column_stack([x[starts], y[starts]]),
         centre=centre,
         origin_frame=origin,
         n_frames=int(frame.max()) - origin + 1 if frame.size else 0,

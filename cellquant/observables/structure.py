@@ -1,0 +1,307 @@
+"""Static structure of the layer: structure factor and pair correlation."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import cKDTree
+
+from cellquant.observables.blocks import (
+    jackknife_error,
+    leave_one_out,
+    ratio_with_error,
+)
+from cellquant.observables.shape import cell_blocks
+from cellquant.observables.smoothing import FloatArray, IntArray
+from cellquant.tables import Cells, Tracks
+
+_GROUPS = 8  # interleaved groups of wave vectors, for the error of the peak
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Positions of some frames, and the rectangle they live in.
+
+    Attributes
+    ----------
+    rows
+        Rows of the source in the chosen frames with a finite position.
+    frames
+        The chosen frame numbers.
+    corner, edges
+        Lower corner and edges of the rectangle: the periodic box, the field of view, or the
+        extent of all positions where the field is not known.
+    periodic
+        Whether the rectangle is a periodic box.
+    """
+
+    rows: pd.DataFrame
+    frames: IntArray
+    corner: FloatArray
+    edges: FloatArray
+    periodic: bool
+
+
+def layer_of(source: Tracks | Cells, *, max_frames: int = 32) -> Layer:
+    """Choose at most max_frames frames, evenly spaced, and the rectangle around the cells."""
+    table = source.table
+    place = table[["x", "y"]].to_numpy(dtype=np.float64)
+    known = np.isfinite(place).all(axis=1)
+    table, place = table[known], place[known]
+    present = np.unique(table["frame"].to_numpy(dtype=np.int64))
+    if present.size > max_frames:
+        chosen = np.round(np.linspace(0, present.size - 1, max_frames)).astype(np.int64)
+        present = present[chosen]
+    box = source.box if isinstance(source, Tracks) else None
+    corner = np.zeros(2)
+    if box is not None:
+        edges = np.array(box, dtype=np.float64)
+    elif isinstance(source, Cells):
+        edges = np.array(source.field_of_view, dtype=np.float64)
+    elif len(place):
+        corner = place.min(axis=0)
+        edges = place.max(axis=0) - corner
+    else:
+        edges = np.zeros(2)
+    rows = table[table["frame"].isin(present)].sort_values("frame", kind="stable")
+    return Layer(rows.reset_index(drop=True), present, corner, edges, box is not None)
+
+
+def positions_by_frame(layer: Layer) -> list[tuple[IntArray, FloatArray]]:
+    """Row numbers and positions of each frame, inside the rectangle."""
+    frame = layer.rows["frame"].to_numpy(dtype=np.int64)
+    place = layer.rows[["x", "y"]].to_numpy(dtype=np.float64) - layer.corner
+    if layer.periodic:
+        place = np.mod(place, layer.edges)
+        place = np.where(place >= layer.edges, 0.0, place)
+    cuts = np.searchsorted(frame, layer.frames)
+    groups = np.split(np.arange(frame.size), cuts[1:]) if frame.size else []
+    return [(rows, place[rows]) for rows in groups]
+
+
+@dataclass(frozen=True)
+class StructureFactor:
+    """S(q) and its first peak.
+
+    Attributes
+    ----------
+    table
+        wave_number, value, std_error, n_vectors.
+    peak
+        q_peak, its std_error and height; None with a reason where there is no peak.
+    """
+
+    table: pd.DataFrame
+    peak: dict[str, Any]
+
+
+def structure_factor(
+    source: Tracks | Cells,
+    *,
+    diameter: float | None = None,
+    max_frames: int = 32,
+    max_wave_number: float | None = None,
+) -> StructureFactor:
+    """Static structure factor of the cell centres.
+
+    ``S(q) = N^-1 |sum_j exp(-i q . r_j)|^2``, averaged over frames, for the wave vectors
+    ``q = 2 pi (n_x/L_x, n_y/L_y)``, gathered in shells one ``2 pi/min(L)`` wide. In a periodic
+    box these are all there are. In an open field they are the vectors for which the mean density
+    of the rectangle drops out, so that no window function has to be subtracted.
+
+    Parameters
+    ----------
+    source
+        Tracks or cells.
+    diameter
+        Mean cell diameter, to place the search for the first peak; from the density when None.
+    max_frames
+        Frames used, evenly spaced.
+    max_wave_number
+        Largest q; four times ``2 pi/diameter`` when None.
+
+    Returns
+    -------
+    StructureFactor
+        Errors: spread of the time-averaged values over the vectors of a shell, of the peak:
+        jackknife over eight interleaved groups of vectors. Undefined with fewer than two cells
+        or no extent in x or y. Bias: in an open field that cells fill unevenly, the smallest q
+        measure the envelope of the layer.
+
+    References
+    ----------
+    Hansen & McDonald, Theory of Simple Liquids (2006), section 4.1.
+    """
+    layer = layer_of(source, max_frames=max_frames)
+    frames = [place for _, place in positions_by_frame(layer) if len(place) >= 2]
+    empty = pd.DataFrame({name: np.empty(0) for name in ("wave_number", "value", "std_error")})
+    empty["n_vectors"] = np.empty(0, dtype=np.int64)
+    none = {"q_peak": None, "q_peak_std_error": None}
+    if not frames or not (layer.edges > 0).all():
+        reason = "fewer than two cells in every frame, or all on a line"
+        return StructureFactor(empty, {**none, "reason": reason})
+    density = float(np.mean([len(p) for p in frames])) / float(np.prod(layer.edges))
+    scale = 2 * np.pi / diameter if diameter else 2 * np.pi * np.sqrt(density)
+    limit = 4 * scale if max_wave_number is None else max_wave_number
+    step = 2 * np.pi / layer.edges
+    n_x, n_y = np.maximum(np.ceil(limit / step).astype(int), 1)
+    q_x, q_y = np.arange(n_x + 1) * step[0], np.arange(-n_y, n_y + 1) * step[1]
+    power = np.zeros((q_x.size, q_y.size))
+    for place in frames:
+        wave_x = np.exp(-1j * np.outer(q_x, place[:, 0]))
+        wave_y = np.exp(-1j * np.outer(place[:, 1], q_y))
+        power += np.abs(wave_x @ wave_y) ** 2 / len(place)
+    power /= len(frames)
+    q = np.hypot(*np.meshgrid(q_x, q_y, indexing="ij"))
+    # One of each pair q, -q; on the line q_x = 0 that is q_y > 0.
+    half = (q > 0) & (q <= limit) & ~((q_x[:, None] == 0) & (q_y[None, :] < 0))
+    return _shells(q[half], power[half], float(step.max()), scale)
+
+
+def _shells(q: FloatArray, power: FloatArray, width: float, scale: float) -> StructureFactor:
+    shell = np.floor(q / width - 0.5).astype(np.int64)
+    n_shells = int(shell.max()) + 1
+    # Vectors below half a width, if the rectangle is elongated, join the first shell.
+    shell = np.maximum(shell, 0)
+    group = np.arange(q.size) % _GROUPS
+    counts = np.zeros((_GROUPS, n_shells))
+    sums, wave = np.zeros_like(counts), np.zeros_like(counts)
+    np.add.at(counts, (group, shell), 1.0)
+    np.add.at(sums, (group, shell), power)
+    np.add.at(wave, (group, shell), q)
+    n = counts.sum(axis=0)
+    filled = n > 0
+    n, counts, sums, wave = n[filled], counts[:, filled], sums[:, filled], wave[:, filled]
+    mean_q, value = wave.sum(axis=0) / n, sums.sum(axis=0) / n
+    renumber = np.cumsum(filled) - 1
+    squares = np.bincount(renumber[shell], weights=(power - value[renumber[shell]]) ** 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.where(n >= 2, np.sqrt(squares / (n - 1) / n), np.nan)
+    table = pd.DataFrame(
+        {"wave_number": mean_q, "value": value, "std_error": error, "n_vectors": n.astype(np.int64)}
+    )
+    return StructureFactor(table, _first_peak(mean_q, value, error, sums, counts, scale))
+
+
+def _first_peak(
+    q: FloatArray,
+    value: FloatArray,
+    error: FloatArray,
+    sums: FloatArray,
+    counts: FloatArray,
+    scale: float,
+) -> dict[str, Any]:
+    """Largest S(q) between 0.6 and 1.6 of the scale, refined by a parabola around it."""
+    none: dict[str, Any] = {"q_peak": None, "q_peak_std_error": None}
+    window = (q >= 0.6 * scale) & (q <= 1.6 * scale)
+    if window.sum() < 3:
+        return {**none, "reason": "fewer than three shells lie where the first peak is expected"}
+    k = int(np.flatnonzero(window)[np.argmax(value[window])])
+    if k in (np.flatnonzero(window)[0], np.flatnonzero(window)[-1]):
+        return {**none, "reason": "S(q) has no maximum between 0.6 and 1.6 times 2 pi/d"}
+    if not value[k] - 1 > 3 * error[k]:
+        return {**none, "reason": "the maximum of S(q) does not exceed 1 by three standard errors"}
+    near = np.abs(q - q[k]) <= max(0.12 * q[k], 1.01 * (q[k + 1] - q[k]), 1.01 * (q[k] - q[k - 1]))
+
+    def place(curve: FloatArray) -> tuple[float, float]:
+        bend, slope, level = np.polyfit(q[near] - q[k], curve[near], 2)
+        if bend >= 0:
+            return float(q[k]), float(curve[k])
+        return float(q[k] - slope / (2 * bend)), float(level - slope**2 / (4 * bend))
+
+    found = place(value)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curves = leave_one_out(sums) / leave_one_out(counts)
+    usable = [c for c in curves if np.isfinite(c[near]).all()]
+    spread = (
+        jackknife_error(np.array([place(c) for c in usable])) if len(usable) > 1 else [None] * 2
+    )
+    return {
+        "q_peak": found[0],
+        "q_peak_std_error": spread[0],
+        "height": found[1],
+        "height_std_error": spread[1],
+        "std_error_method": f"jackknife over {_GROUPS} interleaved groups of wave vectors",
+    }
+
+
+def pair_correlation(
+    source: Tracks | Cells,
+    *,
+    diameter: float | None = None,
+    max_distance: float | None = None,
+    bin_width: float | None = None,
+    max_frames: int = 32,
+) -> pd.DataFrame:
+    """Pair correlation function.
+
+    ``g(r) = pairs in the ring / pairs expected of independent points``. In a periodic box the
+    expectation is ``N (N - 1)/2 x ring area / box area``; in an open rectangle a x b it carries
+    the exact fraction of the ring that lies inside, averaged over places and directions,
+    ``1 - 2 r (a + b)/(pi a b) + r^2/(pi a b)``.
+
+    Parameters
+    ----------
+    source
+        Tracks or cells.
+    diameter
+        Mean cell diameter, for the defaults; from the density when None.
+    max_distance
+        Largest r; five diameters, at most half of the shorter edge.
+    bin_width
+        Width of the rings; a twentieth of a diameter when None.
+    max_frames
+        Frames used, evenly spaced.
+
+    Returns
+    -------
+    pandas.DataFrame
+        distance, value, std_error (jackknife over blocks of cells; in an open field these
+        include the difference between border and centre and are too large at long range),
+        n_pairs. Empty with fewer than two cells.
+    """
+    layer = layer_of(source, max_frames=max_frames)
+    names = ("distance", "value", "std_error")
+    frames = [(rows, place) for rows, place in positions_by_frame(layer) if len(rows) >= 2]
+    if not frames or not (layer.edges > 0).all():
+        return pd.DataFrame({**{k: np.empty(0) for k in names}, "n_pairs": np.empty(0, np.int64)})
+    area = float(np.prod(layer.edges))
+    d = diameter or float(np.sqrt(area / np.mean([len(r) for r, _ in frames])))
+    reach = min(max_distance or 5 * d, 0.5 * float(layer.edges.min()))
+    n_bins = max(int(np.floor(reach / (bin_width or d / 20))), 1)
+    edges = np.linspace(0, reach, n_bins + 1)
+    a, b = layer.edges
+    covered = 0.5 * edges**2 * 2 * np.pi * area
+    if not layer.periodic:
+        covered = 2 * np.pi * (area * edges**2 / 2 - 2 * (a + b) * edges**3 / (3 * np.pi))
+        covered += edges**4 / 2
+    share = np.diff(covered) / area**2
+    blocks = cell_blocks(layer.rows, tuple(layer.edges) if layer.periodic else None)
+    found = np.zeros((blocks.n, n_bins))
+    expected = np.zeros(blocks.n)
+    for rows, place in frames:
+        tree = cKDTree(place, boxsize=layer.edges if layer.periodic else None)
+        pairs = tree.query_pairs(reach, output_type="ndarray")
+        gap = _gap(place[pairs[:, 0]], place[pairs[:, 1]], layer)
+        ring = np.minimum(np.searchsorted(edges, gap, side="right") - 1, n_bins - 1)
+        for side in (0, 1):
+            np.add.at(found, (blocks.index[rows[pairs[:, side]]], ring), 0.5)
+        np.add.at(expected, blocks.index[rows], 0.5 * (len(rows) - 1))
+    value, error = ratio_with_error(found, expected[:, None] * share[None])
+    return pd.DataFrame(
+        {
+            "distance": 0.5 * (edges[1:] + edges[:-1]),
+            "value": value,
+            "std_error": error,
+            "n_pairs": np.rint(found.sum(axis=0)).astype(np.int64),
+        }
+    )
+
+
+def _gap(first: FloatArray, second: FloatArray, layer: Layer) -> FloatArray:
+    delta = first - second
+    if layer.periodic:
+        delta -= layer.edges * np.round(delta / layer.edges)
+    gap: FloatArray = np.hypot(delta[:, 0], delta[:, 1])
+    return gap
