@@ -157,6 +157,7 @@ def track_cells(
         )
         after[end], confidence[start] = start, sure
         report = describe(movie, solution, cells.units.length, n_gaps=len(end))
+    report["pixel_size"] = cells.pixel_size
     report["settings"] = {
         "linker": linker,
         "max_distance": max_distance,
