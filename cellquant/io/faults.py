@@ -13,8 +13,8 @@ import numpy as np
 Ints = np.ndarray[Any, np.dtype[np.int64]]
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
-# Columns of the table of parts.
-_LABEL, _PIXELS, _SUM_X, _SUM_Y, _EULER, _BORDER = range(6)
+# Columns of the table of parts; row and column are those of the first pixel in reading order.
+_LABEL, _PIXELS, _SUM_X, _SUM_Y, _EULER, _BORDER, _ROW, _COLUMN = range(8)
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,10 @@ class FrameFaults:
         (n,) pixels of each label, all its parts together.
     x, y
         (n,) centroid of each label in pixels, all its parts together.
+    body
+        (n, 3) row, column of the first pixel in reading order, and pixels of each body.
+    spare
+        (m, 2) row, column of the first pixel of every part that is no body, or of one pixel.
     fragmented
         The labels that have a second part of more than one pixel, rising.
     fragments
@@ -45,6 +49,8 @@ class FrameFaults:
     area: Ints
     x: Floats
     y: Floats
+    body: Ints
+    spare: Ints
     fragmented: Ints
     fragments: int
     specks: int
@@ -83,7 +89,7 @@ def find_faults(labels: np.ndarray[Any, Any]) -> FrameFaults:
     body = np.zeros(len(parts), dtype=bool)
     body[starts] = True
     large = parts[:, _PIXELS] > 1
-    spare = parts[~body & large]
+    fragments = parts[~body & large]
     sums = np.add.reduceat(parts, starts) if len(starts) else parts
     area = sums[:, _PIXELS]
     return FrameFaults(
@@ -91,8 +97,10 @@ def find_faults(labels: np.ndarray[Any, Any]) -> FrameFaults:
         area=area,
         x=sums[:, _SUM_X] / area,
         y=sums[:, _SUM_Y] / area,
-        fragmented=np.unique(spare[:, _LABEL]),
-        fragments=len(spare),
+        body=parts[starts][:, [_ROW, _COLUMN, _PIXELS]],
+        spare=parts[~(body & large)][:, [_ROW, _COLUMN]],
+        fragmented=np.unique(fragments[:, _LABEL]),
+        fragments=len(fragments),
         specks=int(np.count_nonzero(~large)),
         holes=int(np.sum(1 - parts[body & large, _EULER])),
         border_cells=int(np.sum(parts[body, _BORDER])),
@@ -143,14 +151,14 @@ def _root(parent, part):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def _scan(labels):  # type: ignore[no-untyped-def]
-    """Table of the parts of all labels in reading order: label, pixels, sums, Euler, border.
+    """Table of the parts of all labels in reading order: label, pixels, sums, Euler, border, start.
 
     Rows are cut into runs; each run joins the parts of the runs above that it touches.
     """
     height, width = labels.shape
     size = 1024
     parent = np.empty(size, np.int64)
-    table = np.zeros((size, 6), np.int64)
+    table = np.zeros((size, 8), np.int64)
     n_parts = 0
     # Runs of the row above and of this one: first column, column after the last, part.
     above = np.empty((width, 3), np.int64)
@@ -191,12 +199,14 @@ def _scan(labels):  # type: ignore[no-untyped-def]
                     longer = np.empty(size, np.int64)
                     longer[:n_parts] = parent
                     parent = longer
-                    taller = np.zeros((size, 6), np.int64)
+                    taller = np.zeros((size, 8), np.int64)
                     taller[:n_parts] = table
                     table = taller
                 part = n_parts
                 parent[part] = part
                 table[part, 0] = label
+                table[part, 6] = row
+                table[part, 7] = start
                 n_parts += 1
             length = stop - start
             table[part, 1] += length
@@ -218,7 +228,7 @@ def _scan(labels):  # type: ignore[no-untyped-def]
         root = _root(parent, part)
         if root == part:
             place[part] = n_roots
-            for column in range(6):
+            for column in range(8):
                 table[n_roots, column] = table[part, column]
             n_roots += 1
         else:

@@ -43,12 +43,13 @@ _SUBFILE, _WIDTH, _LENGTH, _BITS, _COMPRESSION, _PHOTOMETRIC = 254, 256, 257, 25
 _DESCRIPTION, _STRIP_OFFSETS, _SAMPLES, _ROWS, _STRIP_COUNTS = 270, 273, 277, 278, 279
 _XRES, _YRES, _PREDICTOR, _TILE_WIDTH, _TILE_LENGTH = 282, 283, 317, 322, 323
 _TILE_OFFSETS, _TILE_COUNTS, _FORMAT, _DEPTH, _STK = 324, 325, 339, 32997, 33629
+_FILL_ORDER, _PLANAR = 266, 284
 # A thumbnail, a pyramid level (1) or a transparency mask (4): not a frame.
 _REDUCED = 5
 _NEEDED = frozenset({
     _SUBFILE, _WIDTH, _LENGTH, _BITS, _COMPRESSION, _PHOTOMETRIC, _DESCRIPTION, _STRIP_OFFSETS,
     _SAMPLES, _ROWS, _STRIP_COUNTS, _XRES, _YRES, _PREDICTOR, _TILE_WIDTH, _TILE_LENGTH,
-    _TILE_OFFSETS, _TILE_COUNTS, _FORMAT, _DEPTH,
+    _TILE_OFFSETS, _TILE_COUNTS, _FORMAT, _DEPTH, _FILL_ORDER, _PLANAR,
 })  # fmt: skip
 _TYPES = {
     1: "u1", 2: "S1", 3: "u2", 4: "u4", 5: "u4", 6: "i1", 7: "S1", 8: "i2", 9: "i4", 10: "i4",
@@ -69,20 +70,23 @@ class Directory:
         Rows and columns.
     dtype
         Type of the values in the machine's byte order.
-    compression
-        Name of the compression.
     contiguous
         Position of the values where they lie uncompressed in one run; None otherwise.
-    palette
-        The values are indices into a colour map.
+    samples
+        Values per pixel.
+    planar
+        More than one value per pixel, stored plane after plane.
+    photometric
+        How the values are meant: 2 for RGB, 3 for a colour map (TIFF 6.0, tag 262).
     """
 
     offset: int
     shape: tuple[int, int]
     dtype: np.dtype[np.generic]
-    compression: str
     contiguous: int | None
-    palette: bool
+    samples: int
+    planar: bool
+    photometric: int
 
 
 @dataclass(frozen=True)
@@ -130,7 +134,7 @@ def walk(path: Path) -> Skeleton:
     ------
     InputError
         If the file is missing, is no TIFF, is truncated or damaged, or holds what is no frame of
-        a movie (RGB, several channels, volumes, unknown compression).
+        a movie (volumes, compression or value types that are not read).
     """
     try:
         with path.open("rb") as file:
@@ -261,10 +265,16 @@ def _page(where: str, offset: int, tags: _Tags, size: int) -> Directory:
             f"{MAX_FRAME_PIXELS} pixels are not read: crop or bin the movie, or export it again "
             "if that size is wrong."
         )
-    _refuse_colour(where, tags)
+    if _one(tags, _DEPTH, 1) != 1:
+        raise InputError(f"{where} is a volume; give one plane per frame.")
+    samples, expected = _one(tags, _SAMPLES, 1), down * across
+    planar = samples > 1 and _one(tags, _PLANAR, 1) == 2
+    if planar:
+        expected *= samples
+    stored *= samples
     dtype = _dtype(where, tags)
     compression = _compression(where, tags)
-    offsets, counts = _segments(tags, tiled, down * across, size, compression, stored, dtype)
+    offsets, counts = _segments(tags, tiled, expected, size, compression, stored, dtype)
     bits = _one(tags, _BITS, 1)
     needed = math.ceil(stored * bits / 8)
     total = int(counts.sum())
@@ -279,9 +289,10 @@ def _page(where: str, offset: int, tags: _Tags, size: int) -> Directory:
     starts = offsets.astype(np.int64)
     joined = bool(np.all(starts[1:] == starts[:-1] + counts[:-1]))
     plain = compression == "none" and _one(tags, _PREDICTOR, 1) == 1 and bits >= 8
+    plain = plain and _one(tags, _FILL_ORDER, 1) == 1
     contiguous = int(starts[0]) if plain and not tiled and joined else None
-    palette = _one(tags, _PHOTOMETRIC, 1) == 3
-    return Directory(offset, (height, width), dtype, compression, contiguous, palette)
+    colours = _one(tags, _PHOTOMETRIC, 1)
+    return Directory(offset, (height, width), dtype, contiguous, samples, planar, colours)
 
 
 def _segments(
@@ -312,19 +323,6 @@ def _segments(
     if counts.min() == 0 or offsets.min() == 0:
         raise _Damaged("a strip or tile has no values")
     return offsets.astype(np.int64), counts.astype(np.int64)
-
-
-def _refuse_colour(where: str, tags: _Tags) -> None:
-    samples = _one(tags, _SAMPLES, 1)
-    if samples != 1:
-        colour = _one(tags, _PHOTOMETRIC, 1) in (2, 6)
-        raise InputError(
-            f"{where} has {samples} values per pixel"
-            f"{' (an RGB picture)' if colour else ' (several channels)'}; "
-            "give a single-channel stack: label masks, or one channel of the images."
-        )
-    if _one(tags, _DEPTH, 1) != 1:
-        raise InputError(f"{where} is a volume; give one plane per frame.")
 
 
 def _dtype(where: str, tags: _Tags) -> np.dtype[np.generic]:

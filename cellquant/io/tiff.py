@@ -5,17 +5,20 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import tifffile
 
 from cellquant.errors import InputError
 from cellquant.io.calibration import Metadata
-from cellquant.io.descriptions import describe
+from cellquant.io.descriptions import Layout, describe
 from cellquant.io.tags import ByteOrder, Directory, Skeleton, walk
 
 Array = np.ndarray[Any, np.dtype[Any]]
+
+# Photometric interpretations of TIFF 6.0: RGB and YCbCr, and a colour map.
+_COLOURS, _PALETTE = (2, 6), 3
 
 # Its remarks about odd tags would land on the terminal; what matters is raised by the walk.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
@@ -53,6 +56,7 @@ class TiffMovie:
     _pages: tuple[Directory, ...]
     _byteorder: ByteOrder
     _run: bool
+    _planar: bool
 
     def read(self, index: int) -> Array:
         """Values of frame `index` (0 <= index < n_frames) as stored, in native byte order.
@@ -65,7 +69,10 @@ class TiffMovie:
         with _reading(self.path, index):
             if self._run:
                 return self._read_run(index)
-            return self._read_page(self._pages[index])
+            if self._planar:
+                planes = self._read_page(self._pages[0], (self.n_frames, *self.shape))
+                return np.array(planes[index])
+            return self._read_page(self._pages[index], self.shape)
 
     def _read_run(self, index: int) -> Array:
         start = self._pages[0].contiguous
@@ -77,12 +84,12 @@ class TiffMovie:
         values = np.fromfile(self.path, dtype=stored, count=n_values, offset=offset)
         return values.reshape(self.shape).astype(self.dtype, copy=False)
 
-    def _read_page(self, page: Directory) -> Array:
+    def _read_page(self, page: Directory, shape: tuple[int, ...]) -> Array:
         with tifffile.TiffFile(self.path) as file:
             file.filehandle.seek(page.offset)
             values: Array = tifffile.TiffPage(file, 0).asarray(maxworkers=1)
-        if values.shape != self.shape:
-            raise ValueError(f"decoded to {values.shape} instead of {self.shape}")
+        if values.shape != shape:
+            raise ValueError(f"decoded to {values.shape} instead of {shape}")
         return values
 
 
@@ -115,9 +122,11 @@ def open_tiff(path: Path) -> TiffMovie:
         frames that differ in size or type.
     """
     skeleton = walk(path)
-    layout = describe(path, skeleton.description, skeleton.resolution)
     pages = skeleton.pages
     first = pages[0]
+    if first.samples > 1 and not first.planar:
+        _refuse_colour(path, first)
+    layout = describe(path, skeleton.description, skeleton.resolution)
     for number, page in enumerate(pages):
         if page.shape != first.shape or page.dtype != first.dtype:
             raise InputError(
@@ -130,10 +139,20 @@ def open_tiff(path: Path) -> TiffMovie:
             "save it with axes TYX."
         )
     notes: list[str] = []
+    planar = first.samples > 1
+    if planar:
+        if not _planes_are_frames(first, layout, len(pages)):
+            _refuse_colour(path, first)
+        notes.append(
+            f"{first.samples} colour planes of one page are read as {first.samples} frames, as "
+            "the description of the file says"
+        )
     declared = layout.n_planes
     n_pages, run = len(pages), False
     n_frames, axes = n_pages, layout.axes
-    if declared is not None and declared > n_pages:
+    if planar:
+        n_frames = first.samples
+    elif declared is not None and declared > n_pages:
         if n_pages > 1 or first.contiguous is None:
             raise InputError(
                 f"{path} is truncated: it describes {declared} frames and holds {n_pages}; "
@@ -159,7 +178,7 @@ def open_tiff(path: Path) -> TiffMovie:
         )
     if skeleton.n_reduced:
         notes.append(f"{skeleton.n_reduced} thumbnails or reduced pages are left out")
-    if first.palette:
+    if first.photometric == _PALETTE:
         notes.append("the colour map is ignored: pixel values are read as they are")
     if layout.order is not None and n_frames == n_pages and declared == n_pages:
         if max(layout.order) >= n_pages:
@@ -170,8 +189,26 @@ def open_tiff(path: Path) -> TiffMovie:
         pages = tuple(pages[number] for number in layout.order)
     return TiffMovie(
         path, n_frames, first.shape, first.dtype, axes, layout.metadata, tuple(notes), pages,
-        skeleton.byteorder, run,
+        skeleton.byteorder, run, planar,
     )  # fmt: skip
+
+
+def _planes_are_frames(page: Directory, layout: Layout, n_pages: int) -> bool:
+    """Whether a page of several values per pixel is a short movie.
+
+    tifffile stores an array of 3 or 4 frames as the planes of one colour picture, unless it is
+    told not to; its description gives the array away.
+    """
+    movie = page.planar and n_pages == 1 and layout.dialect == "tifffile"
+    return movie and (layout.n_planes, layout.plane_shape) == (page.samples, page.shape)
+
+
+def _refuse_colour(path: Path, page: Directory) -> NoReturn:
+    kind = "an RGB picture" if page.photometric in _COLOURS else "several channels"
+    raise InputError(
+        f"{path} has {page.samples} values per pixel ({kind}); give a single-channel stack: "
+        "label masks, or one channel of the images."
+    )
 
 
 def _check_run(path: Path, skeleton: Skeleton, n_frames: int) -> None:
