@@ -61,7 +61,7 @@ def test_inspect_prints_what_is_there(movie: Path) -> None:
     assert found["n_frames"] == 30
     assert found["cells_per_frame"]["min"] == found["cells_per_frame"]["max"] == 4
     assert found["calibration"] is None
-    assert found["ids"]["linked"] is False
+    assert found["ids"] == "per frame"
 
 
 def test_track_observe_export(movie: Path, tmp_path: Path) -> None:

@@ -60,6 +60,10 @@ def summary_lines(summary: Mapping[str, Any]) -> list[str]:
     """The scalar results of `observe`, each with unit and standard error."""
     length, time = summary["length_unit"], summary["time_unit"]
     lines = []
+
+    def missing(group: Mapping[str, Any]) -> str:
+        return f"not measurable ({group.get('reason', 'no reason given')})"
+
     shape = summary.get("shape_index")
     if shape:
         lines.append(
@@ -81,10 +85,14 @@ def summary_lines(summary: Mapping[str, Any]) -> list[str]:
     if tau:
         if tau["value"] is None and tau["censored_at"] is not None:
             lines.append(f"tau_alpha: > {tau['censored_at']:g} {time} (1/e not reached)")
+        elif tau["value"] is None:
+            lines.append(f"tau_alpha: {missing(tau)}")
         else:
             lines.append(f"tau_alpha: {with_error(tau['value'], tau['std_error'], time)}")
     speed = summary.get("speed")
-    if speed:
+    if speed and speed["mean"] is None:
+        lines.append(f"speed: {missing(speed)}")
+    elif speed:
         lines.append(
             f"speed: mean {with_error(speed['mean'], speed.get('std_error'))} {length}/{time} "
             f"over {speed['dt']:g} {time}"
