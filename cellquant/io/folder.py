@@ -25,7 +25,7 @@ _CTC_NAME = re.compile(r"(man_track|mask)\d+", re.IGNORECASE)
 _LINEAGES = ("man_track.txt", "res_track.txt")
 _PICKLES = (".npy", ".npz", ".pkl", ".pickle")
 # Names whose numbers span more than this many times the number of files count no frames.
-_MAX_SPAN = 1000
+_MAX_SPAN = 100
 # Regular steps in the numbering are only taken for a numbering habit from this many files on.
 _MIN_REGULAR = 3
 
@@ -216,12 +216,13 @@ def _numbers(folder: Path, files: Sequence[Path]) -> tuple[list[int], list[str]]
     changing = [place for place in range(len(digits[0])) if len({row[place] for row in digits}) > 1]
     if len(files) == 1:
         return [digits[0][-1] if digits[0] else 0], []
-    if len(changing) != 1:
+    if len(changing) > 1:
         raise InputError(
             f"{folder} has names whose frame number is not clear, such as {files[0].name} and "
             f"{files[-1].name}: {len(changing)} numbers change; give a pattern for one movie."
         )
-    numbers = [row[changing[0]] for row in digits]
+    place = changing[0] if changing else -1  # the same number in every name is an error below
+    numbers = [row[place] for row in digits]
     order = np.argsort(np.array(numbers, dtype=object), kind="stable")
     if [int(i) for i in order] != list(range(len(files))) or len(set(numbers)) < len(numbers):
         twice = next((n for n in numbers if numbers.count(n) > 1), numbers[0])

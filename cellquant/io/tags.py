@@ -363,7 +363,11 @@ def _text(tags: _Tags) -> str:
     values = tags.get(_DESCRIPTION)
     if values is None:
         return ""
-    return values.tobytes().split(b"\0", 1)[0].decode("utf-8", errors="replace")
+    raw = values.tobytes().split(b"\0", 1)[0]
+    try:
+        return raw.decode()
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")  # how older programs write the micro sign
 
 
 def _resolution(tags: _Tags) -> tuple[float, float] | None:
