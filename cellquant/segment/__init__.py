@@ -1,16 +1,16 @@
 """Label masks: checked, measured, and made from images."""
 
-from cellquant.segment.contours import Outlines, measure_outlines
-from cellquant.segment.labels import FAULTS, Parts, find_parts
+from cellquant.segment.contours import NEIGHBOUR_GAP, Outlines, measure_outlines
+from cellquant.segment.labels import FAULTS, repair
 from cellquant.segment.measure import FrameCells, measure_cells, measure_frame
 
 __all__ = [
     "FAULTS",
+    "NEIGHBOUR_GAP",
     "FrameCells",
     "Outlines",
-    "Parts",
-    "find_parts",
     "measure_cells",
     "measure_frame",
     "measure_outlines",
+    "repair",
 ]

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from cellquant.io.faults import FrameFaults, find_faults, same_content
 from cellquant.segment.contours import Outlines, measure_outlines
-from cellquant.segment.labels import FAULTS, IntArray, Parts, find_parts, without_dropped
+from cellquant.segment.labels import FAULTS, IntArray, repair
+from cellquant.segment.occupied import OccupiedArea
 from cellquant.tables import CELL_COLUMNS, Cells
 
 if TYPE_CHECKING:
@@ -38,20 +40,22 @@ def measure_frame(labels: np.ndarray[Any, Any]) -> FrameCells:
     FrameCells
         Ordered by label; the rules are those of `cellquant.segment.labels`.
     """
-    return _measure_parts(labels, find_parts(labels))
+    labels = np.ascontiguousarray(labels)
+    return _measure(labels, find_faults(labels))
 
 
-def _measure_parts(labels: np.ndarray[Any, Any], parts: Parts) -> FrameCells:
-    outlines = measure_outlines(without_dropped(labels, parts), parts.row, parts.column)
+def _measure(labels: np.ndarray[Any, Any], found: FrameFaults) -> FrameCells:
+    repaired = repair(labels, found)
+    outlines = measure_outlines(repaired.labels, repaired.row, repaired.column)
     faults = {
-        "fragments": parts.fragments,
-        "specks": parts.specks,
-        "holes": parts.holes,
+        "fragments": found.fragments,
+        "specks": found.specks,
+        "holes": found.holes,
         "enclosed_cells": int(outlines.enclosed.sum()),
         "border_cells": int(outlines.touches_border.sum()),
         "too_small_for_contour": int(np.isnan(outlines.perimeter).sum()),
     }
-    return FrameCells(parts.label, outlines, faults)
+    return FrameCells(repaired.label, outlines, faults)
 
 
 def measure_cells(
@@ -87,21 +91,22 @@ def measure_cells(
     height, width = stack.shape
     faults: Counter[str] = Counter(dict.fromkeys(FAULTS, 0))
     frames: list[pd.DataFrame] = []
-    previous: IntArray | None = None
+    occupied = OccupiedArea(stack.shape)
+    before: tuple[np.ndarray[Any, Any], FrameFaults] | None = None
     n_frames = len(stack)
     for index, number in enumerate(stack.frame_numbers):
         labels = stack[index]
-        parts = find_parts(labels)
-        repeats = previous is not None and np.array_equal(parts.runs, previous)
-        previous = parts.runs
-        if len(parts.runs) == 0:
+        found = find_faults(labels)
+        occupied.add(labels, found.n_labels)
+        if found.n_labels == 0:
             faults["empty_frames"] += 1
-        elif repeats:
+        elif before is not None and same_content(before[0], labels, before[1], found):
             faults["duplicated_frames"] += 1
         else:
-            cells = _measure_parts(labels, parts)
+            cells = _measure(labels, found)
             faults.update(cells.faults)
             frames.append(_table(number, cells, pixel))
+        before = labels, found
         if progress is not None:
             progress(index + 1, n_frames)
     empty = pd.DataFrame({name: np.empty(0, dtype) for name, dtype in CELL_COLUMNS.items()})
@@ -112,7 +117,7 @@ def measure_cells(
         frame_interval=calibration.frame_interval,
         field_of_view=(width * pixel, height * pixel),
         n_frames=n_frames,
-        occupied_area=np.full(n_frames, width * height * pixel * pixel),
+        occupied_area=occupied.areas() * pixel**2,
         faults=dict(faults),
     )
 
