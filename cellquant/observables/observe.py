@@ -1,7 +1,7 @@
 """From tracks, cells or a run to `summary.json` and one tidy table per observable."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,15 +66,17 @@ class Observables:
         Tidy tables by name of the observable.
     units
         Unit names of summary and tables.
+    statistics
+        The content of ``statistics.json``; None where windows were not asked for.
     """
 
     summary: Mapping[str, Any]
     tables: Mapping[str, pd.DataFrame]
     units: Units
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    statistics: Mapping[str, Any] | None = None
 
     def write(self, folder: str | Path) -> None:
-        """Write ``summary.json`` and ``NAME.parquet`` for every table.
+        """Write ``summary.json``, ``NAME.parquet`` for every table, and ``statistics.json``.
 
         Parameters
         ----------
@@ -180,7 +182,12 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
     if needs_tracks(wanted):
         out.summary["processing"] = _processing(context)
     summary: dict[str, Any] = _plain(out.summary)
-    return Observables(summary, out.tables, source.units)
+    statistics = None
+    if "relaxation_times" in out.tables:
+        from cellquant.statistics import study_statistics
+
+        statistics = study_statistics(out.tables["relaxation_times"])
+    return Observables(summary, out.tables, source.units, statistics)
 
 
 def _wanted(source: Tracks | Cells, only: Sequence[str] | None) -> list[str]:

@@ -231,7 +231,7 @@ def _tail_length(mean: float, low: float, high: float) -> float:
     return float(brentq(excess, bottom, top, xtol=1e-14 * mean, rtol=1e-13))
 
 
-def _error(total: FloatArray, count: FloatArray, solve: Any) -> float:
+def _error(total: Any, count: Any, solve: Any) -> float:
     used = count > 0
     rest = leave_one_out(total[used]) / np.maximum(leave_one_out(count[used]), 1)
     return float(jackknife_error(np.array([solve(float(m)) for m in rest])))

@@ -1,0 +1,194 @@
+"""Statistics of a whole study: trends with density, differences between conditions."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cellquant.statistics.comparisons import log_rank, mann_whitney, mean_over_trials
+from cellquant.statistics.mixed import fit_mixed_model
+
+CENSORING_RULE = (
+    "a tau_alpha that is only known to exceed the longest lag, or to be below the shortest, stays "
+    "out of the fit and of the mean; the fit is repeated with it at that bound (at_bound), means "
+    "over bins that hold such values are given as bounds, and their number is stated"
+)
+
+
+def tau_alpha_trend(relaxation_times: pd.DataFrame) -> dict[str, Any]:
+    """Mixed model of tau_alpha against density, per condition.
+
+    Parameters
+    ----------
+    relaxation_times
+        Columns condition, trial, density, tau_alpha, censored_at, below: one row per trial and
+        density bin, as ``relaxation_times.parquet`` of `observe`, of all trials together.
+
+    Returns
+    -------
+    dict
+        Per condition the fields of `MixedModel`, ``at_bound`` (slope, std_error and p_value with
+        every bound taken as a value) where there are bounds, n_censored, n_below.
+    """
+    found = {}
+    for condition, rows in _conditions(relaxation_times):
+        value = rows["tau_alpha"].to_numpy(dtype=np.float64)
+        bound = _bounds(rows)
+        bounded = ~np.isfinite(value) & np.isfinite(bound)
+        density, trial = rows["density"].to_numpy(dtype=np.float64), rows["trial"].to_numpy(str)
+        entry = fit_mixed_model(density, value, trial).as_dict()
+        entry["n_censored"] = int(np.isfinite(rows["censored_at"].to_numpy(np.float64)).sum())
+        entry["n_below"] = int(np.isfinite(rows["below"].to_numpy(np.float64)).sum())
+        if bounded.any():
+            again = fit_mixed_model(density, np.where(bounded, bound, value), trial)
+            entry["at_bound"] = {
+                "slope": again.slope, "std_error": again.std_error, "p_value": again.p_value,
+                "interval_95": again.interval_95,
+            }  # fmt: skip
+        found[condition] = entry
+    return found
+
+
+def _conditions(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    names = table["condition"].fillna("all").astype(str)
+    trials = table["trial"].fillna("1").astype(str)
+    table = table.assign(condition=names, trial=trials)
+    return [(name, table[names == name]) for name in dict.fromkeys(names)]
+
+
+def _bounds(rows: pd.DataFrame) -> Any:
+    upper = rows["below"].to_numpy(dtype=np.float64)
+    lower = rows["censored_at"].to_numpy(dtype=np.float64)
+    return np.where(np.isfinite(lower), lower, upper)
+
+
+def means_by_bin(relaxation_times: pd.DataFrame) -> pd.DataFrame:
+    """Mean tau_alpha and its standard error over trials, per condition and density bin.
+
+    Parameters
+    ----------
+    relaxation_times
+        See `tau_alpha_trend`; bin_centre too.
+
+    Returns
+    -------
+    pandas.DataFrame
+        condition, bin_centre, mean, std_error, n, n_censored, n_below, lower_bound. With a
+        censored trial the mean is NaN and lower_bound is the mean with it at its bound.
+    """
+    rows = []
+    for condition, part in _conditions(relaxation_times):
+        for centre, inside in part.groupby("bin_centre", sort=True):
+            value = inside["tau_alpha"].to_numpy(dtype=np.float64)
+            # Several stacks of one trial are one experiment.
+            lower = inside["censored_at"].to_numpy(dtype=np.float64)
+            below = inside["below"].to_numpy(dtype=np.float64)
+            trial = inside["trial"].to_numpy(str)
+            n_censored, n_below = int(np.isfinite(lower).sum()), int(np.isfinite(below).sum())
+            per_trial = pd.Series(value).groupby(trial).mean().to_numpy()
+            mean = mean_over_trials(per_trial)
+            at_bound = pd.Series(np.where(np.isfinite(lower), lower, value)).groupby(trial).mean()
+            whole = n_censored + n_below == 0
+            rows.append(
+                {
+                    "condition": condition,
+                    "bin_centre": centre,
+                    "mean": mean["mean"] if whole else np.nan,
+                    "std_error": mean["std_error"] if whole else np.nan,
+                    "n": mean["n"],
+                    "n_censored": n_censored,
+                    "n_below": n_below,
+                    "lower_bound": float(at_bound.mean()) if n_below == 0 else np.nan,
+                }
+            )
+    columns = ["condition", "bin_centre", "mean", "std_error", "n", "n_censored", "n_below",
+               "lower_bound"]  # fmt: skip
+    table = pd.DataFrame(rows, columns=columns)
+    kinds = dict.fromkeys(("bin_centre", "mean", "std_error", "lower_bound"), "float64")
+    return table.astype(kinds)
+
+
+def compare_conditions(trial_values: pd.DataFrame) -> list[dict[str, Any]]:
+    """Mann-Whitney tests of every quantity between every pair of conditions.
+
+    Parameters
+    ----------
+    trial_values
+        Columns condition, trial, quantity, value: one row per trial and quantity; optionally
+        censored, where the value is a bound that the true one exceeds.
+
+    Returns
+    -------
+    list of dict
+        The columns of `mann_whitney` with quantity; Holm's correction over the pairs of one
+        quantity. Where values are censored the ranks are not known: P is then that of the
+        log-rank test, ``test`` says so and n_censored counts them.
+    """
+    found: list[dict[str, Any]] = []
+    for quantity, rows in trial_values.groupby("quantity", sort=False):
+        censored = (
+            rows["censored"].to_numpy(bool) if "censored" in rows else np.zeros(len(rows), bool)
+        )
+        names = rows["condition"].astype(str).to_numpy()
+        value = rows["value"].to_numpy(dtype=np.float64)
+        groups = {name: value[names == name] for name in dict.fromkeys(names)}
+        bounds = {name: censored[names == name] for name in groups}
+        table = mann_whitney(groups)
+        for record in table.to_dict("records"):
+            row: dict[str, Any] = {str(key): item for key, item in record.items()}
+            pair = row["first"], row["second"]
+            n_censored = int(sum(bounds[name].sum() for name in pair))
+            row.update(quantity=quantity, test="Mann-Whitney", n_censored=n_censored)
+            if n_censored:
+                keep = [np.isfinite(groups[name]) for name in pair]
+                row["p_value"] = log_rank(
+                    *(groups[name][k] for name, k in zip(pair, keep, strict=True)),
+                    first_censored=bounds[pair[0]][keep[0]],
+                    second_censored=bounds[pair[1]][keep[1]],
+                )
+                row.update(
+                    test="log-rank", u=None, superiority=None, rank_biserial=None, p_holm=None,
+                    smallest_p=None,
+                )  # fmt: skip
+            found.append(row)
+    return found
+
+
+def study_statistics(
+    relaxation_times: pd.DataFrame, trial_values: pd.DataFrame | None = None
+) -> dict[str, Any]:
+    """Content of ``statistics.json``.
+
+    Parameters
+    ----------
+    relaxation_times
+        See `tau_alpha_trend`.
+    trial_values
+        See `compare_conditions`; None when there is nothing to compare.
+
+    Returns
+    -------
+    dict
+        mixed_model (per condition), tau_alpha_by_bin, mann_whitney, censoring (the rule).
+        JSON-ready: None instead of NaN.
+    """
+    tests = [] if trial_values is None else compare_conditions(trial_values)
+    return {
+        "mixed_model": _plain(tau_alpha_trend(relaxation_times)),
+        "tau_alpha_by_bin": _plain(means_by_bin(relaxation_times).to_dict("records")),
+        "mann_whitney": _plain(tests),
+        "censoring": CENSORING_RULE,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Python types only; NaN and infinity become None."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
