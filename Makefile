@@ -2,32 +2,36 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+CORE := $(VENV)/.core
+FULL := $(VENV)/.full
 
 .PHONY: demo test test-slow bench lint clean
 
-$(STAMP): pyproject.toml
+$(CORE): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet -e ".[dev,evaluate,cluster,geff]"
-	touch $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+	touch $@
 
-demo: $(STAMP)
+$(FULL): $(CORE)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev,evaluate,cluster,geff]"
+	touch $@
+
+demo: $(CORE)
 	$(BIN)/cellquant demo -o demo
 
-test: $(STAMP)
+test: $(FULL)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
-test-slow: $(STAMP)
+test-slow: $(FULL)
 	$(BIN)/python -m pytest -m slow --timeout 3600
 
-bench: $(STAMP)
+bench: $(FULL)
 	$(BIN)/python benchmarks/run_all.py
 
-lint: $(STAMP)
+lint: $(FULL)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
