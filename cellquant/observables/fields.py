@@ -32,17 +32,17 @@ def pair_correlation(context: Context, out: Results) -> None:
         max_frames=context.settings.max_frames,
     )
     out.tables["pair_correlation"] = table
-    if len(table):
-        k = int(table["value"].to_numpy().argmax())
+    excess = table["value"] - 1 - 3 * table["std_error"].fillna(np.inf)
+    if (excess > 0).any():
+        k = int(np.nanargmax(table["value"].where(excess > 0).to_numpy()))
         out.summary["pair_correlation"] = {
             "peak_distance": table["distance"].iloc[k],
             "peak_height": table["value"].iloc[k],
             "peak_height_std_error": table["std_error"].iloc[k],
         }
     else:
-        out.summary["pair_correlation"] = {
-            "peak_distance": None, "reason": "fewer than two cells in every frame",
-        }  # fmt: skip
+        reason = "g(r) nowhere exceeds 1 by three standard errors"
+        out.summary["pair_correlation"] = {"peak_distance": None, "reason": reason}
 
 
 def hexatic_order(context: Context, out: Results) -> None:

@@ -88,6 +88,8 @@ class Observables:
             with atomic_path(folder / f"{name}.parquet") as path:
                 write_table(table, path, units=self.units)
         write_json(folder / "summary.json", self.summary)
+        if self.statistics is not None:
+            write_json(folder / "statistics.json", self.statistics)
 
 
 def available_observables() -> dict[str, str]:
