@@ -1,6 +1,9 @@
 """Movies in and out: TIFF stacks, folders of frames, tracking folders, calibration."""
 
 from cellquant.io.calibration import Calibration as Calibration
+from cellquant.io.ctc import compare_lineage as compare_lineage
+from cellquant.io.ctc import read_ctc_lineage as read_ctc_lineage
+from cellquant.io.ctc import write_ctc as write_ctc
 from cellquant.io.inspect import Inspection as Inspection
 from cellquant.io.inspect import inspect_labels as inspect_labels
 from cellquant.io.stack import ImageStack as ImageStack
@@ -14,8 +17,11 @@ __all__ = [
     "ImageStack",
     "Inspection",
     "LabelStack",
+    "compare_lineage",
     "inspect_labels",
+    "read_ctc_lineage",
     "read_images",
     "read_labels",
+    "write_ctc",
     "write_labels",
 ]

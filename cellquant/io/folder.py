@@ -22,7 +22,7 @@ Array = np.ndarray[Any, np.dtype[Any]]
 _SUFFIXES = (".tif", ".tiff")
 # Masks of the Cell Tracking Challenge, by the tool that writes them.
 _CTC_NAME = re.compile(r"(man_track|mask)\d+", re.IGNORECASE)
-_LINEAGES = ("man_track.txt", "res_track.txt")
+LINEAGES = ("man_track.txt", "res_track.txt")
 _PICKLES = (".npy", ".npz", ".pkl", ".pickle")
 # Names whose numbers span more than this many times the number of files count no frames.
 _MAX_SPAN = 100
@@ -141,7 +141,7 @@ def _open_files(folder: Path, files: Sequence[Path]) -> Movie:
         if len(movie.frame_numbers) > 1:
             return movie
     raw, notes = _numbers(folder, files)
-    listed = any((folder / name).is_file() for name in _LINEAGES)
+    listed = any((folder / name).is_file() for name in LINEAGES)
     numbers = raw if listed else _from_zero(raw, notes)
     if numbers[-1] - numbers[0] >= _MAX_SPAN * len(files):
         raise InputError(
