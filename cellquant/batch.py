@@ -5,12 +5,9 @@ the key of the work (configuration, version, digest of the input): a task whose 
 done again, and one whose configuration or input has changed is.
 """
 
-import contextlib
 import glob
-import json
-import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,11 +15,12 @@ from cellquant.config import ConditionConfig, ExperimentConfig, TrialConfig, loa
 from cellquant.engines import Outcome, Task, execute
 from cellquant.errors import InputError
 from cellquant.storage import (
-    MANIFEST,
     RunRecord,
     check_output,
     content_key,
     digest,
+    finished_key,
+    only_writer,
     write_json,
 )
 
@@ -120,7 +118,7 @@ def work_on_stack(task: Task) -> None:
     from cellquant.pipeline import observe_into, track_movie
 
     folder = Path(task["folder"])
-    if finished_key(folder) == task["key"]:
+    if finished_key(folder, "run") == task["key"]:
         return
     shutil.rmtree(folder, ignore_errors=True)
     calibration = task["calibration"]
@@ -156,16 +154,6 @@ def work_on_stack(task: Task) -> None:
             cells=cells,
         )
     record.write(folder)
-
-
-def finished_key(folder: Path) -> str | None:
-    """Key of the finished work in a folder; None where there is none."""
-    try:
-        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        key = content["settings"]["key"] if content["command"] == "run" else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return key if isinstance(key, str) else None
 
 
 def run_experiment(
@@ -212,7 +200,7 @@ def run_experiment(
                 }
             )
             task["folder"] = str(task_folder(folder, task))
-        waiting = [t for t in tasks if finished_key(Path(t["folder"])) != t["key"]]
+        waiting = [t for t in tasks if finished_key(Path(t["folder"]), "run") != t["key"]]
         outcomes: list[Outcome] = []
         for outcome in execute(work_on_stack, waiting, workers=workers, scheduler=scheduler):
             outcomes.append(outcome)
@@ -226,7 +214,7 @@ def run_experiment(
     record.counts = {"stacks": len(tasks), "failed": len(failures)}
     record.notes = [f"{name}: {reason}" for name, reason in failures.items()]
     with only_writer(folder):
-        finished = [t for t in tasks if finished_key(Path(t["folder"])) == t["key"]]
+        finished = [t for t in tasks if finished_key(Path(t["folder"]), "run") == t["key"]]
         if finished:
             from cellquant.study import write_study
 
@@ -245,33 +233,6 @@ def run_experiment(
 
 def _label(task: Task) -> str:
     return f"{task['condition']}/{task['trial']}/{task['name']}"
-
-
-@contextlib.contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system frees even when the process is killed.
-
-    Raises
-    ------
-    InputError
-        If another process is working on the same folder.
-    """
-    descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        try:
-            import fcntl
-
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(
-                f"another cellquant process is writing to {folder}; wait until it has finished, "
-                "or choose another output folder."
-            ) from error
-        except (ImportError, OSError):
-            pass  # a file system without locks: renames still keep every file whole
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def describe(outcome: StudyOutcome) -> list[str]:

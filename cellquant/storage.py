@@ -157,6 +157,43 @@ def content_key(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def finished_key(folder: Path, command: str) -> str | None:
+    """Key of the work that `command` finished in a folder; None where there is none."""
+    try:
+        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        key = content["settings"]["key"] if content["command"] == command else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return key if isinstance(key, str) else None
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock, which the system frees even when the process is killed.
+
+    Raises
+    ------
+    InputError
+        If another process is working on the same folder.
+    """
+    descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"another cellquant process is writing to {folder}; wait until it has finished, "
+                "or choose another output folder."
+            ) from error
+        except (ImportError, OSError):
+            pass  # a file system without locks: renames still keep every file whole
+        yield
+    finally:
+        os.close(descriptor)
+
+
 @dataclass
 class RunRecord:
     """What an output folder's ``run.json`` says: how the results were made, and at what cost.

@@ -13,8 +13,9 @@ import pandas as pd
 import pytest
 import tifffile
 
-from cellquant.batch import only_writer, run_experiment
+from cellquant.batch import run_experiment
 from cellquant.errors import InputError
+from cellquant.storage import only_writer
 from examples import drifting_discs, shuffled
 
 HEAD = """
