@@ -1,0 +1,268 @@
+"""The layer at work: buffers, neighbour list and the choice of the compiled contact rule."""
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cellquant.errors import InputError
+from cellquant.sim import kernels
+from cellquant.sim.scene import Scene, SimulationFailure
+
+Floats = NDArray[np.float64]
+ContactRule = Literal["exact", "quadrature"]
+
+
+def exact_samples(modes: int) -> int:
+    """Samples of a contour from which the exact rule starts its search, a multiple of 8."""
+    return 8 * max(6, modes)
+
+
+class Layer:
+    """Generalised velocities of one layer, with all its buffers.
+
+    Parameters
+    ----------
+    scene
+        The scene; its features choose what is compiled.
+    radius
+        (N,) radii R0_i, L0.
+    box
+        (2,) edges of the periodic box, L0.
+    contact
+        ``"exact"``, or ``"quadrature"``: the published sum over contour points.
+    points
+        Contour points of the quadrature rule, even and >= 8.
+    general
+        Compile every term of the model even where the scene lacks it; the same numbers, slower.
+
+    Attributes
+    ----------
+    evaluations
+        Number of velocity evaluations made.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        radius: Floats,
+        box: Floats,
+        *,
+        contact: ContactRule = "exact",
+        points: int = 40,
+        general: bool = False,
+    ) -> None:
+        if contact not in ("exact", "quadrature"):
+            raise InputError(f"contact must be exact or quadrature, got {contact!r}; choose one.")
+        if points < 8 or points % 2 or points > 100_000:
+            raise InputError(
+                f"points must be an even number from 8 to 100000, got {points}; correct it."
+            )
+        self.scene = scene
+        self.radius = np.ascontiguousarray(radius, dtype=np.float64)
+        self.box = np.ascontiguousarray(box, dtype=np.float64)
+        self.contact = contact
+        self.points = points
+        self.evaluations = 0
+        self.builds = 0
+        n_cells, n_modes = len(self.radius), scene.modes - 1
+        self.n_columns = 3 + 2 * n_modes
+        self.skin = 0.2 * scene.mean_radius
+        self._modes = (0,) * n_modes
+        self._tension = (0,) if scene.has_tension or general else ()
+        self._torque = (0,) if scene.has_torque or general else ()
+        self._numbers = np.array(
+            [scene.v0, scene.k, scene.eta, scene.mu_r, scene.mu_theta, scene.mu_ab], np.float64
+        )
+        size = exact_samples(scene.modes) if contact == "exact" else points
+        angle = 2.0 * math.pi * np.arange(size + kernels.PAD) / size
+        rows = [f(n * angle) for n in range(1, max(scene.modes, 1) + 1) for f in (np.cos, np.sin)]
+        self._padded_table = np.ascontiguousarray(rows)
+        self._table = np.ascontiguousarray(self._padded_table[:, :size])
+        self._record = np.zeros((n_cells, kernels.HEAD + 2 * n_modes))
+        self._rho = np.zeros((n_cells, size + kernels.PAD))
+        self._slope = np.zeros((n_cells, size + kernels.PAD))
+        self._tangent = np.zeros((n_cells, 2 + 2 * n_modes))
+        self._lowest = self.radius.copy()
+        self._energy = np.zeros(n_cells)
+        self._reference: Floats | None = None
+        self._capacity = 6 * n_cells + 64
+        self._n_blocks = -(-n_cells // kernels.BLOCK)
+        self._allocate_roots(12 * kernels.BLOCK)
+
+    def velocity(self, state: Floats, out: Floats) -> None:
+        """Write the deterministic part of d(state)/dt into `out`.
+
+        Parameters
+        ----------
+        state
+            (N, 3 + 2(M-1)) rows x, y, theta, a_2 .. a_M, b_2 .. b_M.
+        out
+            The same shape.
+
+        Raises
+        ------
+        SimulationFailure
+            If a contour is not representable (a0^2 <= 0), crosses itself (R <= 0), or a number is
+            not finite.
+        """
+        self.evaluations += 1
+        self._prepare(state, self._tension if self.contact == "exact" else ())
+        common = (self._first, self._other, self._shift)
+        back = (self._back_first, self._back_pair, self._back_cell)
+        if self.scene.rigid:
+            kernels.rigid_velocity(
+                state, self.radius, *common, *back, self._numbers, out, self._energy
+            )
+        elif self.contact == "exact":
+            self._find_crossings()
+            kernels.exact_velocity(
+                state,
+                self.radius,
+                self._record,
+                self._tangent,
+                self._first,
+                self._other,
+                *back,
+                self._roots,
+                self._root_first,
+                self._root_last,
+                self._sign,
+                self._inside,
+                self._numbers,
+                self._modes,
+                self._tension,
+                self._torque,
+                out,
+                self._energy,
+            )
+        else:
+            kernels.quadrature_velocity(
+                state,
+                self.radius,
+                self._record,
+                self._lowest,
+                self._rho,
+                self._slope,
+                self._padded_table,
+                *common,
+                *back,
+                self._numbers,
+                self._modes,
+                self._tension,
+                self._torque,
+                out,
+            )
+
+    def energies(self, state: Floats) -> Floats:
+        """Energy of every cell: its tension and its share of the overlaps, by the exact rule."""
+        if self.contact != "exact":
+            raise ValueError("energies belong to the exact contact rule")
+        self.velocity(state, np.empty_like(state))
+        return self._energy.copy()
+
+    def contacts(self) -> NDArray[np.int64]:
+        """Pairs (i, j) of cells that overlap in the last state evaluated, one row per image."""
+        first_cell = np.repeat(np.arange(len(self.radius)), np.diff(self._first))
+        pairs = np.column_stack([first_cell, self._other])
+        if self.scene.rigid:
+            raise ValueError("contacts of rigid discs are not listed")
+        return pairs[(self._root_last > self._root_first) | (self._inside > 0)]
+
+    def _prepare(self, state: Floats, tension: tuple[int, ...]) -> None:
+        if self.scene.rigid:
+            self._record[:, :2] = state[:, :2]
+            self._record[:, 2] = self._record[:, 3] = self.radius
+        else:
+            kernels.contours(
+                state,
+                self.radius,
+                self._table,
+                self._modes,
+                tension,
+                self._record,
+                self._rho,
+                self._slope,
+                self._tangent,
+                self._lowest,
+            )
+        if self._reference is None:
+            self._check(kernels.inspect(self._record, self._lowest, self._record[:, [0, 1, 3]])[1])
+            self._rebuild()
+        else:
+            age, fault = kernels.inspect(self._record, self._lowest, self._reference)
+            self._check(fault)
+            if age > 0.5 * self.skin:
+                self._rebuild()
+
+    def _check(self, fault: int) -> None:
+        if fault < 0:
+            return
+        row = self._record[fault]
+        if math.isnan(self._lowest[fault]):
+            reason = "the contour is no longer representable (a0^2 <= 0)"
+        elif not np.isfinite(row).all():
+            reason = "the state is not finite"
+        else:
+            reason = "the contour crosses itself (R <= 0)"
+        raise SimulationFailure(
+            reason,
+            "take a smaller step or the adaptive integrator, a larger eta, or a smaller v0 or phi",
+            cell=fault,
+        )
+
+    def _rebuild(self) -> None:
+        position = np.ascontiguousarray(self._record[:, :2])
+        reach = np.ascontiguousarray(self._record[:, 3])
+        while True:
+            first, other, shift, needed = kernels.find_pairs(
+                position, reach, self.box, self.skin, self._capacity
+            )
+            if needed[0] <= self._capacity:
+                break
+            if needed[0] > 4000 * len(self.radius) + 4000:
+                raise SimulationFailure(
+                    f"{needed[0]} pairs of images overlap",
+                    "the box is far too small for its cells: enlarge it",
+                )
+            self._capacity = int(needed[0])
+        self._first, self._other, self._shift = first, other.copy(), shift.copy()
+        back = kernels.transpose_pairs(self._first, self._other)
+        self._back_first, self._back_pair, self._back_cell = back
+        self._root_first = np.zeros(len(self._other), np.int64)
+        self._root_last = np.zeros(len(self._other), np.int64)
+        self._inside = np.zeros(len(self._other), np.int8)
+        self._reference = np.ascontiguousarray(self._record[:, [0, 1, 3]])
+        self.builds += 1
+
+    def _allocate_roots(self, room: int) -> None:
+        size = self._n_blocks * room
+        self._roots = np.zeros((size, kernels.ROOT))
+        self._root_pair = np.zeros(size, np.int64)
+        self._sign = np.zeros(size)
+
+    def _find_crossings(self) -> None:
+        while True:
+            fault: Any = np.zeros(self._n_blocks, np.int64)
+            kernels.crossings(
+                self._record,
+                self._lowest,
+                self._rho,
+                self._slope,
+                self._padded_table,
+                self._first,
+                self._other,
+                self._shift,
+                self._modes,
+                self._roots,
+                self._root_pair,
+                self._root_first,
+                self._root_last,
+                self._sign,
+                self._inside,
+                fault,
+            )
+            if not fault.any():
+                return
+            self._allocate_roots(2 * len(self._roots) // self._n_blocks)

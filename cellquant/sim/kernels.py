@@ -1,0 +1,1032 @@
+"""Compiled kernels of the deformable-cell layer: neighbour list, contacts, generalised velocities.
+
+Conventions shared by all kernels:
+
+- A state row holds x, y, theta, a_2 .. a_M, b_2 .. b_M of one cell; positions are unwrapped.
+- In the frame of the laboratory a contour is rho(phi) = A0 + Re sum_n C_n exp(i n phi), with
+  C_n = R0 (a_n - i b_n) exp(-i n theta). A record row holds x, y, A0, the largest rho, then the
+  real parts and the imaginary parts of C_2 .. C_M.
+- `modes`, `tension` and `torque` are tuples whose *lengths* are compile-time constants: the number
+  of modes M - 1, and whether the scene has these terms. What is absent is not compiled.
+- An overlap region is bounded by arcs of both contours. Every integral over the arcs is a signed
+  sum over the crossings (+1 where the contour of i leaves j, -1 where it enters), so neither the
+  number of crossings nor their order matters. On the contour of j the signs are opposite.
+- Everything is computed cell by cell or block by block; a block has a fixed number of cells, so
+  that results do not depend on the number of threads.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+FLAGS = {"contract", "nsz", "arcp"}
+REDUCE = {"contract", "nsz", "arcp", "reassoc"}
+BLOCK = 32  # cells whose contacts are searched together
+LANES = 8  # samples evaluated together
+PAD = 8  # samples repeated at the end of a contour row
+HEAD = 4  # entries of a record before the modes
+ROOT = 6  # entries of a root: unit vector on i, unit vector on j, rho on i, rho on j
+HULL_MARGIN = 1e-4  # of the cubic through two samples, relative to A0
+MOST_LOOKS = 400  # closer looks at one pair; only nearly coincident contours need more
+OVERFLOW = 1  # more crossings than the buffer holds
+
+
+@njit(cache=True)
+def find_pairs(
+    position: Any, reach: Any, box: Any, skin: float, capacity: int
+) -> tuple[Any, Any, Any, Any]:
+    """List pairs (i, image of j) whose circles of radius `reach` come closer than `skin`.
+
+    Every pair stands once, with i < j, or i == j and a positive image. Images are enumerated, so
+    boxes smaller than a cell are right as well.
+
+    Returns
+    -------
+    first : (N + 1,) start of the pairs of each cell
+    other : (pairs,) the cell j
+    shift : (pairs, 2) displacement to be added to the unwrapped position of j
+    needed : (1,) number of pairs found; larger than `capacity` where the list did not fit
+    """
+    n_cells = position.shape[0]
+    lx, ly = box[0], box[1]
+    largest = 0.0
+    for i in range(n_cells):
+        largest = max(largest, reach[i])
+    cutoff = 2.0 * largest + skin
+    nx = max(1, min(int(lx / cutoff), 4096))
+    ny = max(1, min(int(ly / cutoff), 4096))
+    rx = int(math.ceil(cutoff / (lx / nx)))
+    ry = int(math.ceil(cutoff / (ly / ny)))
+    head = np.full(nx * ny, -1, np.int64)
+    link = np.empty(n_cells, np.int64)
+    wrap = np.empty((n_cells, 2), np.float64)
+    bin_x = np.empty(n_cells, np.int64)
+    bin_y = np.empty(n_cells, np.int64)
+    for i in range(n_cells - 1, -1, -1):
+        wrap[i, 0] = lx * math.floor(position[i, 0] / lx)
+        wrap[i, 1] = ly * math.floor(position[i, 1] / ly)
+        bin_x[i] = min(nx - 1, int((position[i, 0] - wrap[i, 0]) / lx * nx))
+        bin_y[i] = min(ny - 1, int((position[i, 1] - wrap[i, 1]) / ly * ny))
+        bin_index = bin_x[i] * ny + bin_y[i]
+        link[i] = head[bin_index]
+        head[bin_index] = i
+    first = np.zeros(n_cells + 1, np.int64)
+    other = np.empty(capacity, np.int64)
+    shift = np.empty((capacity, 2), np.float64)
+    count = 0
+    for i in range(n_cells):
+        for ox in range(bin_x[i] - rx, bin_x[i] + rx + 1):
+            image_x = math.floor(ox / nx)
+            for oy in range(bin_y[i] - ry, bin_y[i] + ry + 1):
+                image_y = math.floor(oy / ny)
+                j = head[int(ox - image_x * nx) * ny + int(oy - image_y * ny)]
+                while j >= 0:
+                    itself = j == i and (image_x > 0 or (image_x == 0 and image_y > 0))
+                    if j > i or itself:
+                        sx = image_x * lx + wrap[i, 0] - wrap[j, 0]
+                        sy = image_y * ly + wrap[i, 1] - wrap[j, 1]
+                        dx = position[j, 0] + sx - position[i, 0]
+                        dy = position[j, 1] + sy - position[i, 1]
+                        limit = reach[i] + reach[j] + skin
+                        if dx * dx + dy * dy < limit * limit:
+                            if count < capacity:
+                                other[count] = j
+                                shift[count, 0] = sx
+                                shift[count, 1] = sy
+                            count += 1
+                    j = link[j]
+        first[i + 1] = count
+    kept = min(count, capacity)
+    needed = np.empty(1, np.int64)
+    needed[0] = count
+    return first, other[:kept], shift[:kept], needed
+
+
+@njit(cache=True)
+def transpose_pairs(first: Any, other: Any) -> tuple[Any, Any, Any]:
+    """Index the pairs by their second cell: start per cell, pair numbers, and first cells."""
+    n_cells = first.shape[0] - 1
+    start = np.zeros(n_cells + 1, np.int64)
+    for p in range(other.shape[0]):
+        start[other[p] + 1] += 1
+    for i in range(n_cells):
+        start[i + 1] += start[i]
+    fill = start[:-1].copy()
+    pairs = np.empty(other.shape[0], np.int64)
+    cells = np.empty(other.shape[0], np.int64)
+    for i in range(n_cells):
+        for p in range(first[i], first[i + 1]):
+            pairs[fill[other[p]]] = p
+            cells[fill[other[p]]] = i
+            fill[other[p]] += 1
+    return start, pairs, cells
+
+
+@njit(cache=True, parallel=True, fastmath=REDUCE, error_model="numpy")
+def contours(
+    state: Any,
+    radius: Any,
+    table: Any,
+    modes: Any,
+    tension: Any,
+    record: Any,
+    rho: Any,
+    slope: Any,
+    tangent: Any,
+    lowest: Any,
+) -> None:
+    """Sample every contour; with tension also project the gradient of its length.
+
+    `table` holds cos(n phi_s) in row 2(n - 1) and sin(n phi_s) in row 2(n - 1) + 1, n = 1 .. M.
+    Writes `record`, the samples `rho` and `slope` = d rho / d phi, the smallest sample `lowest`
+    (NaN where a0^2 <= 0) and in `tangent` the length, L_0, then Re and Im of
+    L_n = integral (u + i n v) exp(i n phi), u = rho / |t|, v = slope / |t|.
+    """
+    n_cells = state.shape[0]
+    size = table.shape[1]
+    half = size // 2
+    spacing = 2.0 * math.pi / size
+    n_blocks = (n_cells + BLOCK - 1) // BLOCK
+    for block in prange(n_blocks):
+        even = np.zeros(half)
+        odd = np.zeros(half)
+        even_slope = np.zeros(half)
+        odd_slope = np.zeros(half)
+        between = np.empty((2, len(modes)))
+        for m in range(len(modes)):
+            between[0, m] = math.cos(0.5 * (m + 2) * spacing)
+            between[1, m] = math.sin(0.5 * (m + 2) * spacing)
+        for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
+            r0 = radius[i]
+            power = 0.0
+            bend = 0.0
+            cos_1 = math.cos(state[i, 2])
+            sin_1 = math.sin(state[i, 2])
+            cos_n = cos_1
+            sin_n = sin_1
+            for s in range(half):
+                even[s] = 0.0
+                odd[s] = 0.0
+                even_slope[s] = 0.0
+                odd_slope[s] = 0.0
+            for m in range(len(modes)):
+                n = m + 2
+                cos_n, sin_n = cos_n * cos_1 - sin_n * sin_1, sin_n * cos_1 + cos_n * sin_1
+                a = state[i, 3 + m]
+                b = state[i, 3 + len(modes) + m]
+                power += a * a + b * b
+                re = r0 * (a * cos_n - b * sin_n)
+                im = -r0 * (b * cos_n + a * sin_n)
+                record[i, HEAD + m] = re
+                record[i, HEAD + len(modes) + m] = im
+                bend += n * n * math.sqrt(re * re + im * im)
+                if n % 2 == 0:
+                    for s in range(half):
+                        even[s] += re * table[2 * m + 2, s] - im * table[2 * m + 3, s]
+                        even_slope[s] -= n * (re * table[2 * m + 3, s] + im * table[2 * m + 2, s])
+                else:
+                    for s in range(half):
+                        odd[s] += re * table[2 * m + 2, s] - im * table[2 * m + 3, s]
+                        odd_slope[s] -= n * (re * table[2 * m + 3, s] + im * table[2 * m + 2, s])
+            mean = r0 * math.sqrt(1.0 - 0.5 * power) if power < 2.0 else math.nan
+            record[i, 0] = state[i, 0]
+            record[i, 1] = state[i, 1]
+            record[i, 2] = mean
+            for s in range(half):
+                rho[i, s] = mean + even[s] + odd[s]
+                rho[i, s + half] = mean + even[s] - odd[s]
+                slope[i, s] = even_slope[s] + odd_slope[s]
+                slope[i, s + half] = even_slope[s] - odd_slope[s]
+            for s in range(PAD):
+                rho[i, size + s] = rho[i, s]
+                slope[i, size + s] = slope[i, s]
+            high = rho[i, 0]
+            low = rho[i, 0]
+            for s in range(size):
+                high = max(high, rho[i, s])
+                low = min(low, rho[i, s])
+            # Between two samples the radius exceeds them by at most spacing^2/8 |rho''|.
+            record[i, 3] = high + 0.125 * spacing * spacing * bend
+            lowest[i] = low if power < 2.0 else math.nan
+            if len(tension) > 0:
+                tangent[i, :] = 0.0
+                # The length needs twice the points: the samples, then those half-way between.
+                for grid in range(2):
+                    length = 0.0
+                    constant = 0.0
+                    if grid == 1:
+                        for s in range(half):
+                            even[s] = 0.0
+                            odd[s] = 0.0
+                            even_slope[s] = 0.0
+                            odd_slope[s] = 0.0
+                        for m in range(len(modes)):
+                            n = m + 2
+                            re = record[i, HEAD + m]
+                            im = record[i, HEAD + len(modes) + m]
+                            re, im = (
+                                re * between[0, m] - im * between[1, m],
+                                re * between[1, m] + im * between[0, m],
+                            )
+                            if n % 2 == 0:
+                                for s in range(half):
+                                    c = table[2 * m + 2, s]
+                                    d = table[2 * m + 3, s]
+                                    even[s] += re * c - im * d
+                                    even_slope[s] -= n * (re * d + im * c)
+                            else:
+                                for s in range(half):
+                                    c = table[2 * m + 2, s]
+                                    d = table[2 * m + 3, s]
+                                    odd[s] += re * c - im * d
+                                    odd_slope[s] -= n * (re * d + im * c)
+                    for s in range(half):
+                        r = mean + even[s] + odd[s]
+                        dr = even_slope[s] + odd_slope[s]
+                        stretch = math.sqrt(r * r + dr * dr)
+                        length += stretch
+                        u = r / stretch
+                        v = dr / stretch
+                        r = mean + even[s] - odd[s]
+                        dr = even_slope[s] - odd_slope[s]
+                        stretch = math.sqrt(r * r + dr * dr)
+                        length += stretch
+                        u_half = r / stretch
+                        v_half = dr / stretch
+                        constant += u + u_half
+                        # Even modes see the sum of opposite points, odd modes the difference.
+                        even[s] = u + u_half
+                        odd[s] = u - u_half
+                        even_slope[s] = v + v_half
+                        odd_slope[s] = v - v_half
+                    tangent[i, 0] += 0.5 * spacing * length
+                    tangent[i, 1] += 0.5 * spacing * constant
+                    for m in range(len(modes)):
+                        n = m + 2
+                        re = 0.0
+                        im = 0.0
+                        if n % 2 == 0:
+                            for s in range(half):
+                                c = table[2 * m + 2, s]
+                                d = table[2 * m + 3, s]
+                                re += even[s] * c - n * even_slope[s] * d
+                                im += even[s] * d + n * even_slope[s] * c
+                        else:
+                            for s in range(half):
+                                c = table[2 * m + 2, s]
+                                d = table[2 * m + 3, s]
+                                re += odd[s] * c - n * odd_slope[s] * d
+                                im += odd[s] * d + n * odd_slope[s] * c
+                        if grid == 1:
+                            re, im = (
+                                re * between[0, m] - im * between[1, m],
+                                re * between[1, m] + im * between[0, m],
+                            )
+                        tangent[i, 2 + m] += 0.5 * spacing * re
+                        tangent[i, 2 + len(modes) + m] += 0.5 * spacing * im
+
+
+@njit(cache=True, error_model="numpy")
+def acos_bound(x: float) -> float:
+    """Arc cosine to 7e-5 (Abramowitz & Stegun 4.4.45); pi below -1, 0 above 1."""
+    if x >= 1.0:
+        return 0.0
+    if x <= -1.0:
+        return math.pi
+    y = abs(x)
+    root = math.sqrt(1.0 - y) * (1.5707288 + y * (-0.2121144 + y * (0.0742610 - 0.0187293 * y)))
+    return root if x >= 0.0 else math.pi - root
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def gap(
+    record: Any, i: int, j: int, dx: float, dy: float, cosine: float, sine: float, modes: Any
+) -> tuple[float, float, float, float, float, float, float]:
+    """Depth g of the contour point of i at direction (cosine, sine) inside j, and dg/dphi.
+
+    Also rho and d rho/d phi of i, the distance to the centre of j, and the direction from it.
+    """
+    top = len(modes) - 1
+    pr = record[i, HEAD + top]
+    pi = record[i, HEAD + len(modes) + top]
+    qr = (top + 2) * pr
+    qi = (top + 2) * pi
+    for k in range(len(modes) - 1):
+        m = top - 1 - k
+        cr = record[i, HEAD + m]
+        ci = record[i, HEAD + len(modes) + m]
+        pr, pi = pr * cosine - pi * sine + cr, pr * sine + pi * cosine + ci
+        qr, qi = qr * cosine - qi * sine + (m + 2) * cr, qr * sine + qi * cosine + (m + 2) * ci
+    zr = cosine * cosine - sine * sine
+    zi = 2.0 * cosine * sine
+    rho = record[i, 2] + pr * zr - pi * zi
+    slope = -(qr * zi + qi * zr)
+    x = rho * cosine - dx
+    y = rho * sine - dy
+    tx = slope * cosine - rho * sine
+    ty = slope * sine + rho * cosine
+    inverse = 1.0 / math.sqrt(x * x + y * y)
+    ux = x * inverse
+    uy = y * inverse
+    pr = record[j, HEAD + top]
+    pi = record[j, HEAD + len(modes) + top]
+    qr = (top + 2) * pr
+    qi = (top + 2) * pi
+    for k in range(len(modes) - 1):
+        m = top - 1 - k
+        cr = record[j, HEAD + m]
+        ci = record[j, HEAD + len(modes) + m]
+        pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
+        qr, qi = qr * ux - qi * uy + (m + 2) * cr, qr * uy + qi * ux + (m + 2) * ci
+    zr = ux * ux - uy * uy
+    zi = 2.0 * ux * uy
+    rho_j = record[j, 2] + pr * zr - pi * zi
+    slope_j = -(qr * zi + qi * zr)
+    distance = (x * x + y * y) * inverse
+    depth = rho_j - distance
+    change = slope_j * (ux * ty - uy * tx) * inverse - (ux * tx + uy * ty)
+    return depth, change, rho, slope, distance, ux, uy
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
+    """Rotate a unit vector by a small angle (|angle| < 0.2), to round-off."""
+    q = angle * angle
+    s = angle * (
+        1.0 + q * (-1 / 6 + q * (1 / 120 + q * (-1 / 5040 + q * (1 / 362880 - q / 39916800))))
+    )
+    c = 1.0 + q * (
+        -0.5 + q * (1 / 24 + q * (-1 / 720 + q * (1 / 40320 + q * (-1 / 3628800 + q / 479001600))))
+    )
+    return cosine * c - sine * s, sine * c + cosine * s
+
+
+@njit(cache=True, error_model="numpy")
+def variations(g0: float, g1: float, d0: float, d1: float, width: float, margin: float) -> int:
+    """Possible zeros of the cubic through two samples with slopes: 0, 1, or 2 for "look closer".
+
+    The zeros of a polynomial are at most the sign changes of its Bernstein coefficients.
+    """
+    b1 = g0 + d0 * width * (1 / 3)
+    b2 = g1 - d1 * width * (1 / 3)
+    if (g0 > 0.0) != (g1 > 0.0):
+        if abs(b1) < margin and abs(b2) < margin:
+            return 2
+        up = g0 <= 0.0
+        return 2 if ((b1 > 0.0) == up) and ((b2 > 0.0) != up) else 1
+    if g0 > 0.0:
+        return 2 if min(b1, b2) < margin else 0
+    return 2 if max(b1, b2) > -margin else 0
+
+
+@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
+def crossings(
+    record: Any,
+    lowest: Any,
+    rho: Any,
+    slope: Any,
+    table: Any,
+    first: Any,
+    other: Any,
+    shift: Any,
+    modes: Any,
+    roots: Any,
+    root_pair: Any,
+    root_first: Any,
+    root_last: Any,
+    sign: Any,
+    inside: Any,
+    fault: Any,
+) -> None:
+    """Find where the contours of every listed pair cross.
+
+    The depth of i's contour inside j is sampled on the facing part only. The cubic through two
+    neighbouring samples shows whether there is no crossing between them, one, or a reason to look
+    closer (a grazing contact); crossings are then polished by Newton steps, all of a block at once.
+    """
+    n_cells = record.shape[0]
+    size = table.shape[1] - PAD
+    spacing = 2.0 * math.pi / size
+    n_blocks = (n_cells + BLOCK - 1) // BLOCK
+    room = roots.shape[0] // n_blocks
+    for block in prange(n_blocks):
+        begin = block * BLOCK
+        end = min(n_cells, begin + BLOCK)
+        base = block * room
+        depth = np.empty(size + 2 * LANES)
+        change = np.empty(size + 2 * LANES)
+        stack = np.empty((40, 6))
+        bracket = np.empty((8, room))
+        dx_of, dy_of, cos_of, sin_of = bracket[0], bracket[1], bracket[2], bracket[3]
+        left_of, width_of, guess_of, last_of = bracket[4], bracket[5], bracket[6], bracket[7]
+        i_of = np.empty(room, np.int64)
+        j_of = np.empty(room, np.int64)
+        count = 0
+        for i in range(begin, end):
+            x_i = record[i, 0]
+            y_i = record[i, 1]
+            high_i = record[i, 3]
+            low_i = lowest[i]
+            for p in range(first[i], first[i + 1]):
+                root_first[p] = base + count
+                root_last[p] = base + count
+                inside[p] = 0
+                j = other[p]
+                dx = record[j, 0] + shift[p, 0] - x_i
+                dy = record[j, 1] + shift[p, 1] - y_i
+                square = dx * dx + dy * dy
+                high_j = record[j, 3]
+                if square >= (high_i + high_j) * (high_i + high_j):
+                    continue
+                # The part of i's contour that can lie within the largest radius of j.
+                away = square - high_j * high_j
+                distance = math.sqrt(square)
+                nearest = min(high_i, max(low_i, math.sqrt(max(away, 0.0))))
+                reach = math.pi
+                if distance > 1e-9 * nearest:
+                    reach = acos_bound((away + nearest * nearest) / (2.0 * distance * nearest))
+                n_chunks = int((2.0 * reach / spacing + 2.5 + LANES) / LANES)
+                n_samples = n_chunks * LANES
+                start = 0
+                if n_samples >= size:
+                    n_chunks = size // LANES
+                    n_samples = size + 1
+                else:
+                    centre = math.atan2(dy, dx) / spacing
+                    start = int(math.floor(centre - 0.5 * (n_samples - 1) + 0.5))
+                    start = (start + 2 * size) % size
+                mean_j = record[j, 2]
+                top = len(modes) - 1
+                for chunk in range(n_chunks):
+                    origin = start + chunk * LANES
+                    if origin >= size:
+                        origin -= size
+                    for lane in range(LANES):
+                        s = origin + lane
+                        cosine = table[0, s]
+                        sine = table[1, s]
+                        r = rho[i, s]
+                        dr = slope[i, s]
+                        x = r * cosine - dx
+                        y = r * sine - dy
+                        tx = dr * cosine - r * sine
+                        ty = dr * sine + r * cosine
+                        q = x * x + y * y
+                        inverse = 1.0 / math.sqrt(max(q, 1e-300))
+                        ux = x * inverse
+                        uy = y * inverse
+                        pr = record[j, HEAD + top]
+                        pi = record[j, HEAD + len(modes) + top]
+                        qr = (top + 2) * pr
+                        qi = (top + 2) * pi
+                        for k in range(len(modes) - 1):
+                            m = top - 1 - k
+                            cr = record[j, HEAD + m]
+                            ci = record[j, HEAD + len(modes) + m]
+                            pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
+                            qr, qi = (
+                                qr * ux - qi * uy + (m + 2) * cr,
+                                qr * uy + qi * ux + (m + 2) * ci,
+                            )
+                        zr = ux * ux - uy * uy
+                        zi = 2.0 * ux * uy
+                        depth[chunk * LANES + lane] = mean_j + pr * zr - pi * zi - q * inverse
+                        change[chunk * LANES + lane] = -(qr * zi + qi * zr) * (
+                            ux * ty - uy * tx
+                        ) * inverse - (ux * tx + uy * ty)
+                if n_samples == size + 1:
+                    depth[size] = depth[0]
+                    change[size] = change[0]
+                    largest = 0.0
+                    for l in range(size):
+                        largest = max(largest, abs(depth[l]))
+                    if largest < 1e-12 * mean_j:
+                        inside[p] = 1  # the same contour twice: i counts as inside j
+                        continue
+                margin = HULL_MARGIN * mean_j
+                looks = 0
+                for l in range(n_samples - 1):
+                    g0 = depth[l]
+                    g1 = depth[l + 1]
+                    kind = variations(g0, g1, change[l], change[l + 1], spacing, margin)
+                    if kind == 0:
+                        continue
+                    s = (start + l) % size
+                    stack[0, 0] = 0.0
+                    stack[0, 1] = spacing
+                    stack[0, 2] = g0
+                    stack[0, 3] = g1
+                    stack[0, 4] = change[l]
+                    stack[0, 5] = change[l + 1]
+                    height = 1
+                    while height > 0:
+                        height -= 1
+                        left = stack[height, 0]
+                        width = stack[height, 1]
+                        g0 = stack[height, 2]
+                        g1 = stack[height, 3]
+                        d0 = stack[height, 4]
+                        d1 = stack[height, 5]
+                        fraction = width / spacing
+                        finer = margin * fraction * fraction * fraction * fraction
+                        kind = variations(g0, g1, d0, d1, width, finer)
+                        if kind == 2 and width > 1e-9 and looks < MOST_LOOKS:
+                            looks += 1
+                            width *= 0.5
+                            ca, sa = turn(table[0, s], table[1, s], left + width)
+                            gm, dm, _, _, _, _, _ = gap(record, i, j, dx, dy, ca, sa, modes)
+                            # The left half lies on top, so that crossings come in order.
+                            stack[height, 0] = left + width
+                            stack[height, 1] = width
+                            stack[height, 2] = gm
+                            stack[height, 3] = g1
+                            stack[height, 4] = dm
+                            stack[height, 5] = d1
+                            height += 1
+                            stack[height, 0] = left
+                            stack[height, 1] = width
+                            stack[height, 2] = g0
+                            stack[height, 3] = gm
+                            stack[height, 4] = d0
+                            stack[height, 5] = dm
+                            height += 1
+                        elif (g0 > 0.0) != (g1 > 0.0):
+                            if count == room:
+                                fault[block] = OVERFLOW
+                                break
+                            # Zero of the cubic: inverse interpolation, then Newton steps.
+                            t = g0 / (g0 - g1)
+                            e0 = d0 * width
+                            e1 = d1 * width
+                            c2 = 3.0 * (g1 - g0) - 2.0 * e0 - e1
+                            c3 = 2.0 * (g0 - g1) + e0 + e1
+                            for _ in range(3):
+                                value = g0 + t * (e0 + t * (c2 + t * c3))
+                                rate = e0 + t * (2.0 * c2 + 3.0 * t * c3)
+                                t -= value / rate if rate != 0.0 else 0.0
+                                t = min(1.0, max(0.0, t))
+                            dx_of[count] = dx
+                            dy_of[count] = dy
+                            cos_of[count] = table[0, s]
+                            sin_of[count] = table[1, s]
+                            left_of[count] = left
+                            width_of[count] = width
+                            guess_of[count] = left + t * width
+                            i_of[count] = i
+                            j_of[count] = j
+                            sign[base + count] = 1.0 if g0 > 0.0 else -1.0
+                            root_pair[base + count] = p
+                            count += 1
+                if count == root_first[p] - base:
+                    if n_samples == size + 1 and depth[0] > 0.0:
+                        inside[p] = 1
+                    elif distance + lowest[j] < high_i:
+                        g, _, _, _, _, _, _ = gap(record, j, i, -dx, -dy, 1.0, 0.0, modes)
+                        if g > 0.0:
+                            inside[p] = 2
+                root_last[p] = base + count
+        # Newton steps on all crossings of the block; two suffice after the cubic.
+        for r in range(count):
+            angle = guess_of[r]
+            step = 0.0
+            for _ in range(2):
+                ca, sa = turn(cos_of[r], sin_of[r], angle)
+                g, rate, _, _, _, _, _ = gap(
+                    record, i_of[r], j_of[r], dx_of[r], dy_of[r], ca, sa, modes
+                )
+                step = -g / rate
+                angle = min(left_of[r] + width_of[r], max(left_of[r], angle + step))
+            guess_of[r] = angle
+            last_of[r] = abs(step)
+        for r in range(count):
+            angle = guess_of[r]
+            if not last_of[r] < 1e-8:
+                low = left_of[r]
+                high = left_of[r] + width_of[r]
+                if not low <= angle <= high:
+                    angle = 0.5 * (low + high)
+                for _ in range(80):
+                    ca, sa = turn(cos_of[r], sin_of[r], angle)
+                    g, rate, _, _, _, _, _ = gap(
+                        record, i_of[r], j_of[r], dx_of[r], dy_of[r], ca, sa, modes
+                    )
+                    if (g > 0.0) == (sign[base + r] > 0.0):
+                        low = angle
+                    else:
+                        high = angle
+                    moved = angle - g / rate if rate != 0.0 else low - 1.0
+                    if not low < moved < high:
+                        moved = 0.5 * (low + high)
+                    step = abs(moved - angle)
+                    angle = moved
+                    if step < 1e-15 or high - low < 1e-15:
+                        break
+            ca, sa = turn(cos_of[r], sin_of[r], angle)
+            _, _, rho_i, _, rho_j, ux, uy = gap(
+                record, i_of[r], j_of[r], dx_of[r], dy_of[r], ca, sa, modes
+            )
+            roots[base + r, 0] = ca
+            roots[base + r, 1] = sa
+            roots[base + r, 2] = ux
+            roots[base + r, 3] = uy
+            roots[base + r, 4] = rho_i
+            roots[base + r, 5] = rho_j
+
+
+@njit(cache=True, parallel=True, fastmath=REDUCE, error_model="numpy")
+def exact_velocity(
+    state: Any,
+    radius: Any,
+    record: Any,
+    tangent: Any,
+    first: Any,
+    other: Any,
+    back_first: Any,
+    back_pair: Any,
+    back_cell: Any,
+    roots: Any,
+    root_first: Any,
+    root_last: Any,
+    sign: Any,
+    inside: Any,
+    numbers: Any,
+    modes: Any,
+    tension: Any,
+    torque: Any,
+    velocity: Any,
+    energy: Any,
+) -> None:
+    """Generalised velocity and energy of every cell from the crossings of its contour.
+
+    `numbers` holds v0, k, eta, mu_r, mu_theta, mu_ab. With W_k = integral over the arcs of
+    exp(i k phi), the shape forces are a convolution of W with the modes.
+    """
+    v0, k, eta = numbers[0], numbers[1], numbers[2]
+    mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
+    n_cells = state.shape[0]
+    n_blocks = (n_cells + BLOCK - 1) // BLOCK
+    n_powers = 2 * len(modes) + 3
+    for block in prange(n_blocks):
+        wr = np.empty(n_powers)
+        wi = np.empty(n_powers)
+        for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
+            for m in range(n_powers):
+                wr[m] = 0.0
+                wi[m] = 0.0
+            fx = 0.0
+            fy = 0.0
+            spin = 0.0
+            lens = 0.0
+            n_own = first[i + 1] - first[i]
+            n_all = n_own + back_first[i + 1] - back_first[i]
+            for entry in range(n_all):
+                own = entry < n_own
+                if own:
+                    p = first[i] + entry
+                else:
+                    p = back_pair[back_first[i] + entry - n_own]
+                if inside[p] == (1 if own else 2):
+                    wr[0] += 2.0 * math.pi
+                if root_first[p] == root_last[p]:
+                    continue
+                arc_r = 1.0
+                arc_i = 0.0
+                for r in range(root_first[p], root_last[p]):
+                    if own:
+                        s = sign[r]
+                        c1 = roots[r, 0]
+                        s1 = roots[r, 1]
+                        distance = roots[r, 4]
+                        lens -= (
+                            0.5 * s * distance * roots[r, 5] * (c1 * roots[r, 3] - s1 * roots[r, 2])
+                        )
+                    else:
+                        s = -sign[r]
+                        c1 = roots[r, 2]
+                        s1 = roots[r, 3]
+                        distance = roots[r, 5]
+                    fx += s * distance * s1
+                    fy -= s * distance * c1
+                    spin += 0.5 * s * distance * distance
+                    arc_r, arc_i = arc_r * c1 - s * arc_i * s1, arc_i * c1 + s * arc_r * s1
+                    cn = c1
+                    sn = s1
+                    for n in range(1, n_powers):
+                        wr[n] += s * sn
+                        wi[n] -= s * cn
+                        cn, sn = cn * c1 - sn * s1, sn * c1 + cn * s1
+                angle = math.atan2(arc_i, arc_r)
+                if angle < 0.0:
+                    angle += 2.0 * math.pi
+                    if angle > 2.0 * math.pi - 1e-6:
+                        # Round-off, or a cell inside but for a sliver: ask its far side.
+                        r = root_first[p]
+                        j = other[p] if own else i
+                        dx = roots[r, 4] * roots[r, 0] - roots[r, 5] * roots[r, 2]
+                        dy = roots[r, 4] * roots[r, 1] - roots[r, 5] * roots[r, 3]
+                        if own:
+                            g, _, _, _, _, _, _ = gap(
+                                record, i, j, dx, dy, -roots[r, 0], -roots[r, 1], modes
+                            )
+                        else:
+                            j = back_cell[back_first[i] + entry - n_own]
+                            g, _, _, _, _, _, _ = gap(
+                                record, i, j, -dx, -dy, -roots[r, 2], -roots[r, 3], modes
+                            )
+                        if g <= 0.0:
+                            angle = 0.0
+                wr[0] += angle
+            # W_n = (exp(i n phi_out) - exp(i n phi_in)) / (i n), summed above without 1/n.
+            for n in range(1, n_powers):
+                wr[n] /= n
+                wi[n] /= n
+            mean = record[i, 2]
+            j0 = mean * wr[0]
+            for m in range(len(modes)):
+                j0 += record[i, HEAD + m] * wr[m + 2] - record[i, HEAD + len(modes) + m] * wi[m + 2]
+            area = mean * j0
+            cos_1 = math.cos(state[i, 2])
+            sin_1 = math.sin(state[i, 2])
+            constant = k * j0
+            bound = 0.0
+            if len(tension) > 0:
+                constant += eta * tangent[i, 1]
+                bound = eta * tangent[i, 0]
+            a0 = mean / radius[i]
+            scale = mu_ab * radius[i]
+            cos_n = cos_1
+            sin_n = sin_1
+            for m in range(len(modes)):
+                n = m + 2
+                cos_n, sin_n = cos_n * cos_1 - sin_n * sin_1, sin_n * cos_1 + cos_n * sin_1
+                jr = mean * wr[n]
+                ji = mean * wi[n]
+                for l in range(len(modes)):
+                    cr = 0.5 * record[i, HEAD + l]
+                    ci = 0.5 * record[i, HEAD + len(modes) + l]
+                    up = n + l + 2
+                    jr += cr * wr[up] - ci * wi[up]
+                    ji += cr * wi[up] + ci * wr[up]
+                    if l <= m:
+                        jr += cr * wr[m - l] + ci * wi[m - l]
+                        ji += cr * wi[m - l] - ci * wr[m - l]
+                    else:
+                        jr += cr * wr[l - m] - ci * wi[l - m]
+                        ji -= cr * wi[l - m] + ci * wr[l - m]
+                area += record[i, HEAD + m] * jr - record[i, HEAD + len(modes) + m] * ji
+                jr *= k
+                ji *= k
+                if len(tension) > 0:
+                    jr += eta * tangent[i, 2 + m]
+                    ji += eta * tangent[i, 2 + len(modes) + m]
+                a = state[i, 3 + m]
+                b = state[i, 3 + len(modes) + m]
+                pull = 0.5 * constant / a0
+                velocity[i, 3 + m] = -scale * (jr * cos_n + ji * sin_n - a * pull)
+                velocity[i, 3 + len(modes) + m] = -scale * (ji * cos_n - jr * sin_n - b * pull)
+            velocity[i, 0] = v0 * cos_1 - mu_r * k * fx
+            velocity[i, 1] = v0 * sin_1 - mu_r * k * fy
+            if len(torque) > 0:
+                velocity[i, 2] = mu_theta * k * spin
+            else:
+                velocity[i, 2] = 0.0
+            energy[i] = bound + k * (0.5 * area + lens)
+
+
+@njit(cache=True, parallel=True, fastmath=REDUCE, error_model="numpy")
+def quadrature_velocity(
+    state: Any,
+    radius: Any,
+    record: Any,
+    lowest: Any,
+    rho: Any,
+    slope: Any,
+    table: Any,
+    first: Any,
+    other: Any,
+    shift: Any,
+    back_first: Any,
+    back_pair: Any,
+    back_cell: Any,
+    numbers: Any,
+    modes: Any,
+    tension: Any,
+    torque: Any,
+    velocity: Any,
+) -> None:
+    """Generalised velocity by the published rule: sums over the contour points inside a neighbour.
+
+    The points stand at fixed directions phi_s = 2 pi s / K. Only how many neighbours hold a point
+    matters, so the neighbours are counted first and every sum is taken once.
+    """
+    v0, k, eta = numbers[0], numbers[1], numbers[2]
+    mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
+    n_cells = state.shape[0]
+    size = table.shape[1] - PAD
+    spacing = 2.0 * math.pi / size
+    half = size // 2
+    n_blocks = (n_cells + BLOCK - 1) // BLOCK
+    for block in prange(n_blocks):
+        held = np.empty(size + PAD)
+        u = np.empty(size)
+        v = np.empty(size)
+        even = np.empty(half)
+        odd = np.empty(half)
+        even_slope = np.empty(half)
+        odd_slope = np.empty(half)
+        for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
+            for s in range(size + PAD):
+                held[s] = 0.0
+            high_i = record[i, 3]
+            n_own = first[i + 1] - first[i]
+            n_all = n_own + back_first[i + 1] - back_first[i]
+            for entry in range(n_all):
+                if entry < n_own:
+                    p = first[i] + entry
+                    j = other[p]
+                    dx = record[j, 0] + shift[p, 0] - record[i, 0]
+                    dy = record[j, 1] + shift[p, 1] - record[i, 1]
+                else:
+                    p = back_pair[back_first[i] + entry - n_own]
+                    j = back_cell[back_first[i] + entry - n_own]
+                    dx = record[j, 0] - shift[p, 0] - record[i, 0]
+                    dy = record[j, 1] - shift[p, 1] - record[i, 1]
+                square = dx * dx + dy * dy
+                high_j = record[j, 3]
+                if square >= (high_i + high_j) * (high_i + high_j):
+                    continue
+                away = square - high_j * high_j
+                nearest = min(high_i, max(lowest[i], math.sqrt(max(away, 0.0))))
+                reach = math.pi
+                distance = math.sqrt(square)
+                if distance > 1e-9 * nearest:
+                    reach = acos_bound((away + nearest * nearest) / (2.0 * distance * nearest))
+                n_chunks = int((2.0 * reach / spacing + 1.5 + LANES) / LANES)
+                start = 0
+                if n_chunks * LANES >= size:
+                    n_chunks = (size + LANES - 1) // LANES
+                else:
+                    centre = math.atan2(dy, dx) / spacing
+                    start = int(math.floor(centre - 0.5 * (n_chunks * LANES - 1) + 0.5))
+                    start = (start + 2 * size) % size
+                mean_j = record[j, 2]
+                top = len(modes) - 1
+                for chunk in range(n_chunks):
+                    origin = start + chunk * LANES
+                    if origin >= size:
+                        origin -= size
+                    stop = size + start if n_chunks * LANES >= size else size + PAD
+                    for lane in range(LANES):
+                        s = origin + lane
+                        x = rho[i, s] * table[0, s] - dx
+                        y = rho[i, s] * table[1, s] - dy
+                        q = x * x + y * y
+                        inverse = 1.0 / math.sqrt(max(q, 1e-300))
+                        ux = x * inverse
+                        uy = y * inverse
+                        pr = record[j, HEAD + top]
+                        pi = record[j, HEAD + len(modes) + top]
+                        for m in range(len(modes) - 1):
+                            cr = record[j, HEAD + top - 1 - m]
+                            ci = record[j, HEAD + len(modes) + top - 1 - m]
+                            pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
+                        depth = mean_j + pr * (ux * ux - uy * uy) - pi * (2.0 * ux * uy)
+                        depth -= q * inverse
+                        held[s] += 1.0 if depth > 0.0 and s < stop else 0.0
+            for s in range(PAD):
+                held[s] += held[size + s]
+            fx = 0.0
+            fy = 0.0
+            spin = 0.0
+            constant = 0.0
+            for s in range(size):
+                r = rho[i, s]
+                dr = slope[i, s]
+                fx += held[s] * (dr * table[1, s] + r * table[0, s])
+                fy += held[s] * (r * table[1, s] - dr * table[0, s])
+                spin += held[s] * r * dr
+                u[s] = k * held[s] * r
+                if len(tension) > 0:
+                    inverse = 1.0 / math.sqrt(r * r + dr * dr)
+                    u[s] += eta * r * inverse
+                    v[s] = eta * dr * inverse
+                constant += u[s]
+            for s in range(half):
+                even[s] = u[s] + u[s + half]
+                odd[s] = u[s] - u[s + half]
+                if len(tension) > 0:
+                    even_slope[s] = v[s] + v[s + half]
+                    odd_slope[s] = v[s] - v[s + half]
+            cos_1 = math.cos(state[i, 2])
+            sin_1 = math.sin(state[i, 2])
+            pull = 0.5 * constant * radius[i] / record[i, 2]
+            scale = spacing * mu_ab * radius[i]
+            cos_n = cos_1
+            sin_n = sin_1
+            for m in range(len(modes)):
+                n = m + 2
+                cos_n, sin_n = cos_n * cos_1 - sin_n * sin_1, sin_n * cos_1 + cos_n * sin_1
+                re = 0.0
+                im = 0.0
+                if n % 2 == 0:
+                    for s in range(half):
+                        re += even[s] * table[2 * m + 2, s]
+                        im += even[s] * table[2 * m + 3, s]
+                    if len(tension) > 0:
+                        for s in range(half):
+                            re -= n * even_slope[s] * table[2 * m + 3, s]
+                            im += n * even_slope[s] * table[2 * m + 2, s]
+                else:
+                    for s in range(half):
+                        re += odd[s] * table[2 * m + 2, s]
+                        im += odd[s] * table[2 * m + 3, s]
+                    if len(tension) > 0:
+                        for s in range(half):
+                            re -= n * odd_slope[s] * table[2 * m + 3, s]
+                            im += n * odd_slope[s] * table[2 * m + 2, s]
+                a = state[i, 3 + m]
+                b = state[i, 3 + len(modes) + m]
+                velocity[i, 3 + m] = -scale * (re * cos_n + im * sin_n - a * pull)
+                velocity[i, 3 + len(modes) + m] = -scale * (im * cos_n - re * sin_n - b * pull)
+            velocity[i, 0] = v0 * cos_1 - mu_r * k * spacing * fx
+            velocity[i, 1] = v0 * sin_1 - mu_r * k * spacing * fy
+            if len(torque) > 0:
+                velocity[i, 2] = mu_theta * k * spacing * spin
+            else:
+                velocity[i, 2] = 0.0
+
+
+@njit(cache=True, parallel=True, fastmath=REDUCE, error_model="numpy")
+def rigid_velocity(
+    state: Any,
+    radius: Any,
+    first: Any,
+    other: Any,
+    shift: Any,
+    back_first: Any,
+    back_pair: Any,
+    back_cell: Any,
+    numbers: Any,
+    velocity: Any,
+    energy: Any,
+) -> None:
+    """Velocity and energy of rigid discs: the overlap of two circles is known in closed form."""
+    v0, k, eta, mu_r = numbers[0], numbers[1], numbers[2], numbers[3]
+    for i in prange(state.shape[0]):
+        fx = 0.0
+        fy = 0.0
+        area = 0.0
+        n_own = first[i + 1] - first[i]
+        n_all = n_own + back_first[i + 1] - back_first[i]
+        for entry in range(n_all):
+            if entry < n_own:
+                p = first[i] + entry
+                j = other[p]
+                side = 1.0
+            else:
+                p = back_pair[back_first[i] + entry - n_own]
+                j = back_cell[back_first[i] + entry - n_own]
+                side = -1.0
+            dx = state[j, 0] + side * shift[p, 0] - state[i, 0]
+            dy = state[j, 1] + side * shift[p, 1] - state[i, 1]
+            square = dx * dx + dy * dy
+            ri = radius[i]
+            rj = radius[j]
+            if square >= (ri + rj) * (ri + rj):
+                continue
+            if square <= (ri - rj) * (ri - rj):
+                area += 0.5 * math.pi * min(ri, rj) ** 2
+                continue
+            distance = math.sqrt(square)
+            along = 0.5 * (square + ri * ri - rj * rj) / distance
+            chord = 2.0 * math.sqrt(max(0.0, ri * ri - along * along))
+            fx += chord * dx / distance
+            fy += chord * dy / distance
+            angle_i = math.acos(max(-1.0, min(1.0, along / ri)))
+            angle_j = math.acos(max(-1.0, min(1.0, (distance - along) / rj)))
+            area += 0.5 * (ri * ri * angle_i + rj * rj * angle_j - 0.5 * distance * chord)
+        velocity[i, 0] = v0 * math.cos(state[i, 2]) - mu_r * k * fx
+        velocity[i, 1] = v0 * math.sin(state[i, 2]) - mu_r * k * fy
+        velocity[i, 2] = 0.0
+        energy[i] = k * area + 2.0 * math.pi * eta * radius[i]
+
+
+@njit(cache=True)
+def inspect(record: Any, lowest: Any, reference: Any) -> tuple[float, int]:
+    """How far the neighbour list has aged, and the first cell whose contour is not one.
+
+    The age is the largest sum of displacement and growth of the reach since the list was made.
+    The cell is -1 where every contour has rho > 0; NaN counts as a fault.
+    """
+    age = 0.0
+    fault = -1
+    for i in range(record.shape[0]):
+        if not (lowest[i] > 0.0 and math.isfinite(record[i, 0] + record[i, 1] + record[i, 3])):
+            fault = i
+            break
+        dx = record[i, 0] - reference[i, 0]
+        dy = record[i, 1] - reference[i, 1]
+        age = max(age, math.sqrt(dx * dx + dy * dy) + record[i, 3] - reference[i, 2])
+    return age, fault
