@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from cellquant.compare.results import Result
 from cellquant.storage import write_json
 from cellquant.tables import PHYSICAL, REDUCED, Cells, Tracks, Units, write_table
 
@@ -22,6 +24,14 @@ class Layer:
     summary: dict[str, Any]
     tables: dict[str, pd.DataFrame]
     record: dict[str, Any] = field(default_factory=dict)
+    run: Any = None
+
+    def result(self, name: str) -> Result:
+        """The layer as a result in memory, with its pictures."""
+        stack: Any = None if self.run is not None else Stack(self.masks, 1.3, 10.0)
+        return Result(
+            name, self.summary, self.tables, self.record, None, self.tracks, stack, self.run
+        )
 
     def write(self, folder: Path) -> Path:
         """Write what ``cellquant observe`` leaves in its folder."""
@@ -118,6 +128,7 @@ def make_layer(
         box=(extent, extent) if simulated else None,
         provenance={"search_range": 0.35 * spacing * pixel, "notes": ["IDs are per frame."]},
     )
+    run = _run_of(points * pixel, spacing * pixel, extent, seed) if simulated else None
     summary, tables = _observables(tracks, tau=tau, shape=shape, seed=seed)
     record = {
         "program": "cellquant",
@@ -128,7 +139,24 @@ def make_layer(
         "notes": ["Frame 3 & 4 are <equal>."],
         "stages": [{"stage": "read", "wall_s": float(seed), "cpu_s": 0.1}],
     }
-    return Layer(masks, cells, tracks, summary, tables, record)
+    return Layer(masks, cells, tracks, summary, tables, record, run)
+
+
+def _run_of(points: np.ndarray, spacing: float, extent: float, seed: int) -> SimpleNamespace:
+    """The last state of a run, as far as a snapshot needs it."""
+    rng = np.random.default_rng(seed)
+    n = len(points)
+    return SimpleNamespace(
+        position=points[None],
+        polarity=rng.uniform(0, 2 * np.pi, (1, n)),
+        modes=rng.normal(0, 0.04, (1, n, 2, 5)),
+        radius=np.full(n, spacing / 2),
+        box=np.array([extent, extent]),
+        scene=SimpleNamespace(phi=0.97, v0=0.03, eta=0.01),
+    )
+
+
+_QUANTILES = {"0.05": 0.02, "0.25": 0.05, "0.5": 0.09, "0.75": 0.13, "0.95": 0.21}
 
 
 def _observables(
@@ -160,7 +188,23 @@ def _observables(
         "shape_index": pd.DataFrame(
             {"shape_index": p, "value": density, "std_error": 0.05 * density, "n": 100}
         ),
-        "van_hove": pd.DataFrame({"r": r, "value": hove, "std_error": 0.05 * hove}),
+        "van_hove": pd.DataFrame(
+            {
+                "r": r,
+                "value": hove,
+                "std_error": 0.05 * hove,
+                "gaussian": hove[0] * np.exp(-(r**2) / 0.18),
+                "exponential": 0.05 * hove[0] * np.exp(-r / 0.13),
+            }
+        ),
+        "relaxation_times": pd.DataFrame(
+            {
+                "bin_centre": [1100.0, 1350.0, 1600.0],
+                "density": [1120.0, 1330.0, 1590.0],
+                "tau_alpha": [0.8 * tau, tau, 1.4 * tau],
+                "std_error": 0.06 * tau,
+            }
+        ),
     }
     summary = {
         "n_frames": int(tracks.table["frame"].nunique()),
@@ -172,9 +216,12 @@ def _observables(
         "shape_index": {
             "mean": shape, "median": shape - 0.02, "mode": shape - 0.08, "std": 2 * scale,
             "skewness": 1.0, "std_error": 0.006, "n": 10 * n_cells,
+            "median_std_error": 0.007, "mode_std_error": 0.01, "std_std_error": 0.004,
+            "skewness_std_error": 0.1,
+            "quantiles": {q: 3.6 + f * 3 for q, f in _QUANTILES.items()},
         },
         "wave_number": {
-            "q": 2 * np.pi / diameter, "rule": "2pi/d", "mean_diameter": diameter,
+            "q": 2 * np.pi / diameter, "rule": "2pi/d", "mean_diameter": diameter, "mean_diameter_std_error": 0.004 * diameter,
             "q_peak": 6.1 / diameter,
         },
         "tau_alpha": {"value": tau, "std_error": 0.06 * tau, "censored_at": None},
@@ -183,8 +230,11 @@ def _observables(
             "xi_std_error": 0.01, "normalisation": "radial", "core_range": [0, 0.5],
             "tail_range": [0.6, 1.2],
         },
-        "speed": {"mean": 0.1 * diameter / interval, "median": 0.09 * diameter / interval,
-                  "dt": interval},
+        "speed": {
+            "mean": 0.1 * diameter / interval, "median": 0.09 * diameter / interval,
+            "std_error": 0.004 * diameter / interval, "dt": interval,
+            "quantiles": {q: f * diameter / interval for q, f in _QUANTILES.items()},
+        },
         "chi4_peak": {"value": None, "reason": "fewer than 100 tracks"},
     }  # fmt: skip
     return summary, tables

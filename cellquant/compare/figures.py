@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cellquant.compare.page import MINUS
+from cellquant.compare.page import MINUS, format_value
 from cellquant.compare.svg import canvas, colour, series_colour, to_svg
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ def draw_curves(
     y: Scale,
     marks: Sequence[Mark] = (),
     legend_rows: int | None = None,
+    top: tuple[float, str] | None = None,
 ) -> str:
     """Draw curves in one pair of axes, as an ``<svg>`` element.
 
@@ -87,22 +88,30 @@ def draw_curves(
     legend_rows
         Height kept for the legend, so that drawings beside each other match; from the curves
         when None.
+    top
+        A second scale of x above the axes: factor from x to it, and its label.
     """
     rows = count_legend_rows(curves) if legend_rows is None else legend_rows
-    with canvas(height=3.3 + 0.2 * rows) as (figure, axes):
+    above = 0.2 * rows + (0.42 if top is not None else 0.0)
+    with canvas(height=3.3 + above) as (figure, axes):
         place = axes.get_position()
         height = figure.get_figheight()
-        top = (height - 0.16 - 0.2 * rows) / height
-        axes.set_position((place.x0, place.y0, place.width, top - place.y0))
+        share = (height - 0.16 - above) / height
+        axes.set_position((place.x0, place.y0, place.width, share - place.y0))
         for curve in curves:
             _draw(axes, curve)
         _set_scales(axes, x, y)
         for mark in marks:
             _draw_mark(axes, mark)
-        if rows:
+        if top is not None:
+            _draw_top_scale(axes, *top, log=x.log)
+        if count_legend_rows(curves):
             axes.legend(
                 loc="lower left",
-                bbox_to_anchor=(-0.02, 1.0),
+                bbox_to_anchor=(
+                    -0.02,
+                    1.0 if top is None else 1.0 + 0.42 / (share * height - 0.56),
+                ),
                 ncols=_legend_columns(curves),
                 borderaxespad=0.2,
                 handletextpad=0.5,
@@ -147,8 +156,7 @@ def draw_map(
     x: tuple[str, Sequence[float]],
     y: tuple[str, Sequence[float]],
     limits: tuple[float, float],
-    digits: int = 3,
-    faint: FloatArray | None = None,
+    errors: FloatArray,
 ) -> str:
     """Draw a table of numbers as coloured fields with the numbers written in them.
 
@@ -160,7 +168,7 @@ def draw_map(
         Label and values of columns and rows.
     limits
         Values of the first and last colour, the same for maps that stand beside each other.
-    faint
+    errors
         Same shape, standard errors, written below the numbers.
     """
     import matplotlib as mpl
@@ -182,13 +190,11 @@ def draw_map(
                     )
                 )
                 luminance = float(np.dot(shade[:3], (0.299, 0.587, 0.114)))
-                text = f"{value:.{digits}f}"
-                if faint is not None and np.isfinite(faint[row, column]):
-                    text += f"\n±{faint[row, column]:.{digits}f}"
+                text = format_value(float(value), float(errors[row, column]))
                 axes.text(
                     column,
                     row,
-                    text,
+                    text.replace(" ± ", "\n± "),
                     ha="center",
                     va="center",
                     fontsize=9,
@@ -296,6 +302,12 @@ def _set_scales(axes: "Axes", x: Scale, y: Scale) -> None:
             continue
         low, high = axis.get_view_interval()
         decades = math.log10(high / low) if low > 0 else 1.0
+        if decades < 0.9:
+            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+            axis.set_major_formatter(FuncFormatter(_log_tick))
+            axis.set_minor_formatter(NullFormatter())
+            axis.set_tick_params(which="minor", length=0)
+            continue
         steps = (1.0,) if decades > 2.2 else (1.0, 2.0, 5.0)
         axis.set_major_locator(LogLocator(subs=steps))
         axis.set_major_formatter(FuncFormatter(_log_tick))
@@ -304,7 +316,57 @@ def _set_scales(axes: "Axes", x: Scale, y: Scale) -> None:
         axis.set_tick_params(which="minor", length=2)
 
 
+def _draw_top_scale(axes: "Axes", factor: float, label: str, *, log: bool) -> None:
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    def there(value: Any) -> Any:
+        return np.asarray(value) * factor
+
+    def back(value: Any) -> Any:
+        return np.asarray(value) / factor
+
+    second = axes.secondary_xaxis("top", functions=(there, back))
+    second.set_xlabel(label, color=colour("muted"), fontsize=9)
+    second.tick_params(labelsize=8, labelcolor=colour("muted"), length=2.5)
+    if log:
+        second.xaxis.set_major_formatter(FuncFormatter(_log_tick))
+        second.xaxis.set_minor_formatter(NullFormatter())
+
+
+def draw_boxes(boxes: Sequence[tuple[str, int, Sequence[float]]], name: str, *, label: str) -> str:
+    """Draw distributions as lying boxes: quantiles 0.05, 0.25, 0.5, 0.75 and 0.95.
+
+    Parameters
+    ----------
+    boxes
+        (name, number of the colour, the five quantiles) of each, from top to bottom.
+    label
+        Label of the axis.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    with canvas(height=0.85 + 0.52 * len(boxes)) as (figure, axes):
+        place = axes.get_position()
+        axes.set_position((0.02, place.y0, 0.95, 0.98 - place.y0))
+        for row, (title, series, quantiles) in enumerate(boxes):
+            low, first, middle, third, high = quantiles
+            shade = series_colour(series)
+            axes.plot([low, high], [row, row], color=shade, linewidth=1.2)
+            axes.barh(row, third - first, 0.36, first, color=shade, alpha=0.35)
+            axes.plot([middle, middle], [row - 0.18, row + 0.18], color=shade, linewidth=2.2)
+            axes.annotate(title, (0, row), (0, 10), xycoords=("axes fraction", "data"),
+                          textcoords="offset points", fontsize=9)  # fmt: skip
+        axes.set_ylim(len(boxes) - 0.4, -0.75)
+        axes.set_yticks([])
+        axes.spines["left"].set_visible(False)
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+        axes.set_xlabel(label)
+        return to_svg(figure, name)
+
+
 def _log_tick(value: float, _position: int | None) -> str:
+    if value <= 0:
+        return ""
     if 1e-3 < value < 1e5:
         return f"{value:g}"
     exponent = math.floor(math.log10(value) + 1e-9)

@@ -1,5 +1,6 @@
 """One self-contained HTML page: what it is made of, and how it is written."""
 
+import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -103,6 +104,11 @@ class Page:
 
 def render_page(page: Page) -> str:
     """The page as HTML; equal pages give equal text."""
+    return str(_template().render(page=page, theme=THEME, font=FONT_STACK, version=__version__))
+
+
+@functools.cache
+def _template() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -112,9 +118,8 @@ def render_page(page: Page) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(marked=_marked, csv_uri=_csv_uri, inline=_inline)
-    template = environment.get_template("report.html.j2")
-    return template.render(page=page, theme=THEME, font=FONT_STACK, version=__version__)
+    environment.filters.update(marked=_marked, bare=_bare, csv_uri=_csv_uri, inline=_inline)
+    return environment.get_template("report.html.j2")
 
 
 def write_page(page: Page, path: str | Path) -> None:
@@ -197,6 +202,11 @@ def _marked(text: str) -> Any:
     safe = str(escape(text))
     safe = re.sub(r"_\{([^{}]*)\}", r"<sub>\1</sub>", safe)
     return Markup(re.sub(r"\^\{([^{}]*)\}", r"<sup>\1</sup>", safe))
+
+
+def _bare(text: str) -> str:
+    """Drop the marks of sub- and superscripts, where only plain text can stand."""
+    return re.sub(r"[_^]\{([^{}]*)\}", r"\1", text)
 
 
 def _inline(svg: str, alt: str) -> Any:

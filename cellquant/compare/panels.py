@@ -130,7 +130,7 @@ def shape_figure(results: Sequence[Result], *, name: str = "shape-index") -> Fig
         title="Distribution of the shape index",
         caption="All cells away from the border, all frames pooled; the area under the curve is 1.",
         panels=(Panel(name, svg, f"Distribution of the shape index with its peak at {peak:.2f}."),),
-        data=_joined({c.label: c for c in drawn}, "shape_index"),
+        data=join_curves({c.label: c for c in drawn}, "shape_index"),
     )
 
 
@@ -179,7 +179,7 @@ def scattering_figure(results: Sequence[Result]) -> Figure | None:
         caption=f"F_{{s}}(q, t) at q = {_wave_number(results[0])}; the band is the standard error. "
         "Where the line 1/e is crossed, the layer has relaxed.",
         panels=(Panel(name, svg, f"F_s against lag time on a logarithmic axis. {words}"),),
-        data=_joined({c.label: c for c in drawn}, "lag_time"),
+        data=join_curves({c.label: c for c in drawn}, "lag_time"),
     )
 
 
@@ -212,7 +212,7 @@ def msd_figure(results: Sequence[Result]) -> Figure | None:
         caption="Relative to the drift of the whole layer. Parallel to the dashed line the cells "
         "diffuse; steeper, they go straight; flatter, they are caged.",
         panels=(Panel(name, svg, "Mean square displacement against lag time, both logarithmic."),),
-        data=_joined({c.label: c for c in drawn}, "lag_time"),
+        data=join_curves({c.label: c for c in drawn}, "lag_time"),
     )
 
 
@@ -338,7 +338,8 @@ def _curves(results: Sequence[Result], table: str) -> list[Curve]:
     return [curve for curve in found if curve is not None]
 
 
-def _joined(curves: Mapping[str, Curve], x: str) -> "pd.DataFrame":
+def join_curves(curves: Mapping[str, Curve], x: str) -> "pd.DataFrame":
+    """The points of several curves as one tidy table, its abscissa named `x`."""
     import pandas as pd
 
     parts = []

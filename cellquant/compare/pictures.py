@@ -4,10 +4,9 @@ import base64
 import math
 from collections.abc import Mapping
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from cellquant.compare.results import unit_text
 from cellquant.compare.svg import (
@@ -20,6 +19,11 @@ from cellquant.compare.svg import (
     to_svg,
 )
 from cellquant.tables import Units
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from cellquant.sim import Run
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
@@ -129,7 +133,24 @@ def draw_contours(
     return _framed(body, width, height, scale=scale, length_unit=units.length)
 
 
-def thin_paths(table: pd.DataFrame, *, max_points: int = MAX_POINTS) -> pd.DataFrame:
+def contours_of(run: "Run", *, points: int = 32) -> tuple[FloatArray, tuple[float, float]]:
+    """Contours (N, K, 2) of the cells in the last saved state of a run, and its box."""
+    angle = 2 * np.pi * np.arange(points) / points
+    modes = np.asarray(run.modes[-1], dtype=np.float64)
+    n = np.arange(2, modes.shape[-1] + 2)
+    radius = np.asarray(run.radius, dtype=np.float64)
+    a0 = np.sqrt(1 - 0.5 * (modes**2).sum(axis=(1, 2)))
+    shape = a0[:, None] + modes[:, 0] @ np.cos(np.outer(n, angle))
+    shape = shape + modes[:, 1] @ np.sin(np.outer(n, angle))
+    direction = angle[None] + np.asarray(run.polarity[-1], dtype=np.float64)[:, None]
+    reach = radius[:, None] * shape
+    offsets = np.stack([reach * np.cos(direction), reach * np.sin(direction)], axis=-1)
+    contours: FloatArray = np.asarray(run.position[-1], dtype=np.float64)[:, None] + offsets
+    box = np.asarray(run.box, dtype=np.float64)
+    return contours, (float(box[0]), float(box[1]))
+
+
+def thin_paths(table: "pd.DataFrame", *, max_points: int = MAX_POINTS) -> "pd.DataFrame":
     """Keep as many points of the trajectories as a drawing can show.
 
     Whole tracks are kept while they fit (longest first), each thinned to every k-th frame with
@@ -154,7 +175,7 @@ def thin_paths(table: pd.DataFrame, *, max_points: int = MAX_POINTS) -> pd.DataF
 
 
 def draw_paths(
-    paths: pd.DataFrame,
+    paths: "pd.DataFrame",
     name: str,
     *,
     units: Units,

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +11,15 @@ import numpy as np
 
 from cellquant.compare.figures import Curve
 from cellquant.errors import InputError
-from cellquant.tables import Units, read_table
+from cellquant.tables import Units, read_table, read_tracks
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from cellquant.io import LabelStack
     from cellquant.observables import Observables
+    from cellquant.sim import Run
+    from cellquant.tables import Tracks
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -124,6 +127,12 @@ class Result:
         How it was made: the content of ``run.json``; empty when not known.
     folder
         Where it was read from; None for results in memory.
+    tracks
+        Trajectories, for the pictures; None where they are not at hand.
+    stack
+        Label masks of the movie, or None.
+    run
+        The simulated run, or None.
     """
 
     name: str
@@ -131,6 +140,9 @@ class Result:
     tables: Mapping[str, "pd.DataFrame"]
     record: Mapping[str, Any]
     folder: Path | None = None
+    tracks: "Tracks | None" = None
+    stack: "LabelStack | None" = None
+    run: "Run | None" = None
 
     @property
     def units(self) -> Units:
@@ -187,6 +199,62 @@ def read_result(source: "str | Path | Observables | Result", *, name: str = "") 
         if file.stem not in {"tracks", "cells"}
     }
     return Result(name or folder.resolve().name, summary, tables, record, folder)
+
+
+def with_sources(result: Result) -> Result:
+    """Add the trajectories, masks or run that a result was made from, where they are at hand.
+
+    They are looked for in the result's folder and at the paths that its record names; what is
+    gone or cannot be read stays None.
+    """
+    if result.folder is None:
+        return result
+    records = [result.record, *result.record.get("earlier", [])]
+    places = [result.folder]
+    for record in records:
+        source = record.get("settings", {}).get("source")
+        if isinstance(source, str):
+            places += [Path(source), result.folder / source]
+    found = result
+    for place in places:
+        try:
+            if found.tracks is None and (place / "tracks.parquet").is_file():
+                found = replace(found, tracks=read_tracks(place))
+            elif found.run is None and (place / "zarr.json").is_file():
+                from cellquant.sim import open_run
+
+                run = open_run(place)
+                found = replace(found, run=run, tracks=run.to_tracks())
+        except (InputError, OSError):
+            continue
+    for record in records:
+        if found.stack is None and not found.simulated:
+            found = replace(found, stack=_masks_of(record, result.folder))
+    return found
+
+
+def _masks_of(record: Mapping[str, Any], folder: Path) -> "LabelStack | None":
+    from cellquant.io import read_labels
+
+    settings = record.get("settings", {})
+    named = [settings.get("masks"), *record.get("inputs", {})]
+    if settings.get("pixel_size") is None and "calibration" not in settings:
+        return None
+    for path in [Path(name) for name in named if isinstance(name, str)]:
+        for place in (path, folder / path.name):
+            if not place.exists() or place.suffix in {".parquet", ".toml", ".json", ".zarr"}:
+                continue
+            try:
+                if settings.get("length_unit") == "px":
+                    return read_labels(place, units="pixel")
+                return read_labels(
+                    place,
+                    pixel_size=settings.get("pixel_size"),
+                    frame_interval=settings.get("frame_interval"),
+                )
+            except (InputError, OSError):
+                continue
+    return None
 
 
 def look_up(summary: Mapping[str, Any], key: str) -> Any:

@@ -1,0 +1,300 @@
+"""Figures of a comparison: experiments in one drawing, simulations in the other, same axes."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cellquant.compare.figures import (
+    Curve,
+    Mark,
+    Scale,
+    common_limits,
+    count_legend_rows,
+    draw_curves,
+)
+from cellquant.compare.groups import Group
+from cellquant.compare.page import Figure, Panel
+from cellquant.compare.panels import join_curves, shape_limits
+from cellquant.compare.results import with_sources
+
+if TYPE_CHECKING:
+    pass
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+MAX_CURVES = 6
+MAX_PICTURES = 3
+Measure = Callable[[Group, int], list[Curve]]
+
+
+def shape_figure(groups: Sequence[Group]) -> Figure | None:
+    """P(p) of both sides."""
+
+    def measure(group: Group, series: int) -> list[Curve]:
+        curve = group.curve("shape_index", x="shape_index", series=series)
+        return [] if curve is None else [curve]
+
+    sides = _by_side(groups, measure)
+    every = [curve for _, curves in sides for curve in curves]
+    if not every:
+        return None
+    top = 1.06 * max(float(np.nanmax(c.y)) for c in every)
+    return _paired(
+        sides,
+        name="shape-index",
+        title="Distribution of the shape index",
+        caption="Bands are standard errors. The area under each curve is 1.",
+        alt="Distributions of the shape index",
+        x=Scale("shape index p = P/√A", limits=shape_limits(every)),
+        y=Scale("P(p)", limits=(0.0, top)),
+        column="shape_index",
+    )
+
+
+def scattering_figure(groups: Sequence[Group]) -> Figure | None:
+    """F_s against t/tau_alpha."""
+    sides = _by_side(groups, _scaled("self_intermediate_scattering", by_tau=True))
+    every = [curve for _, curves in sides for curve in curves]
+    if not every:
+        return None
+    return _paired(
+        sides,
+        name="self-intermediate-scattering",
+        title="Memory of places: self-intermediate scattering",
+        caption="At q = 2π/d. The dotted line is 1/e. Scenes and movies that do not relax have no "
+        "τ_{α} and are left out here.",
+        alt="F_s against time in units of the relaxation time",
+        x=Scale("t/τ_{α}", log=True, limits=common_limits([c.x for c in every], log=True)),
+        y=Scale("F_{s}(q, t)", limits=(-0.08, 1.08)),
+        marks=(Mark(float(np.exp(-1)), "1/e", axis="y"),),
+        column="lag_over_tau_alpha",
+        own_time=groups,
+    )
+
+
+def displacement_figure(groups: Sequence[Group]) -> Figure | None:
+    """MSD/d^2 against t/tau_alpha."""
+    sides = _by_side(groups, _scaled("msd", by_tau=True, by_area=True))
+    every = [curve for _, curves in sides for curve in curves]
+    if not every:
+        return None
+    return _paired(
+        sides,
+        name="mean-square-displacement",
+        title="Mean square displacement",
+        caption="In units of the squared mean diameter.",
+        alt="Mean square displacement against time, both logarithmic",
+        x=Scale("t/τ_{α}", log=True, limits=common_limits([c.x for c in every], log=True)),
+        y=Scale("MSD/d^{2}", log=True, limits=common_limits([c.y for c in every], log=True)),
+        column="lag_over_tau_alpha",
+        own_time=groups,
+    )
+
+
+def hove_figure(groups: Sequence[Group]) -> Figure | None:
+    """Self van Hove function at tau_alpha, with the fits of core and tail."""
+
+    def measure(group: Group, series: int) -> list[Curve]:
+        curve = group.curve("van_hove", x="r", series=series)
+        if curve is None:
+            return []
+        drawn = [replace(curve, y=np.where(curve.y > 0, curve.y, np.nan), kind="points")]
+        data = group.members[0].tables["van_hove"]
+        for fit in ("gaussian", "exponential"):
+            if fit in data.columns:
+                drawn.append(
+                    Curve("", data["r"].to_numpy(np.float64), data[fit].to_numpy(np.float64), None,
+                          series, "dashes" if fit == "gaussian" else "line")
+                )  # fmt: skip
+        return drawn
+
+    sides = _by_side(groups, measure)
+    every = [curve for _, curves in sides for curve in curves if curve.label]
+    if not every:
+        return None
+    return _paired(
+        sides,
+        name="van-hove",
+        title="Displacements after one relaxation time: van Hove function",
+        caption="Probability per area of a displacement r at t = τ_{α}, r in units of d. Dashed: "
+        "Gaussian fit of the core; full line: exponential fit of the tail (of the first trial).",
+        alt="Van Hove functions with Gaussian core and exponential tail",
+        x=Scale("r/d", limits=(0.0, max(float(np.nanmax(c.x)) for c in every))),
+        y=Scale("G_{s}(r, τ_{α}) d^{2}", log=True,
+                limits=common_limits([c.y for c in every], log=True)),
+        column="r_over_d",
+    )  # fmt: skip
+
+
+def layer_figure(groups: Sequence[Group]) -> Figure | None:
+    """Segmented frame of a movie beside a snapshot of the model."""
+    from cellquant.compare.pictures import contours_of, draw_contours, draw_masks
+
+    panels = []
+    for index, group in enumerate(with_pictures(groups)):
+        result = group.members[0]
+        name = f"layer-{index + 1}"
+        if result.stack is not None:
+            frame = len(result.stack) // 2
+            calibration = result.stack.calibration
+            svg = draw_masks(result.stack[frame], pixel_size=calibration.pixel_size,
+                             units=calibration.units)  # fmt: skip
+            words = f"Segmented frame {frame} of {group.name}, cells in different colours."
+        elif result.run is not None:
+            svg = draw_contours(*contours_of(result.run), units=result.units)
+            words = f"Contours of all cells of {group.name} at the end of the run."
+        else:
+            continue
+        panels.append(Panel(name, svg, words, group.name))
+    if not panels:
+        return None
+    return Figure(
+        name="layer",
+        title="One moment",
+        caption="Segmented frame of the movie; contours of all cells of the simulated layer, which "
+        "continues periodically at its edges.",
+        panels=tuple(panels),
+        wide=True,
+    )
+
+
+def paths_figure(groups: Sequence[Group]) -> Figure | None:
+    """Trajectories in windows of the same size in cell diameters."""
+    import pandas as pd
+
+    from cellquant.compare.pictures import draw_paths, thin_paths
+    from cellquant.tables import Units
+
+    panels, parts = [], []
+    for index, group in enumerate(with_pictures(groups)):
+        tracks = group.members[0].tracks
+        d = group.scalars().get("wave_number.mean_diameter")
+        tau = group.scalars().get("tau_alpha.value")
+        if tracks is None or d is None or tracks.table.empty:
+            continue
+        table = tracks.table[["track_id", "frame", "x", "y"]].copy()
+        table[["x", "y"]] /= d.value
+        shown = "the whole recording"
+        if tau is not None and math.isfinite(tau.value):
+            last = table["frame"].max()
+            span = max(2, round(2 * tau.value / tracks.frame_interval))
+            table = table[table["frame"] > last - span]
+            shown = "the last two τ_{α}"
+        middle = table[["x", "y"]].median().to_numpy()
+        window = (middle[0] - 5, middle[0] + 5, middle[1] - 5, middle[1] + 5)
+        inside = table["x"].between(*window[:2]) & table["y"].between(*window[2:])
+        near = table[table["track_id"].isin(table.loc[inside, "track_id"].unique())]
+        paths = thin_paths(near, max_points=5000)
+        if paths.empty:
+            continue
+        name = f"paths-{index + 1}"
+        svg = draw_paths(paths, name, units=Units("d", tracks.units.time), window=window)
+        words = f"Paths of cells of {group.name} over {shown.replace('_{α}', ' alpha')}."
+        panels.append(Panel(name, svg, words, group.name))
+        parts.append(paths.assign(result=group.name))
+    if not panels:
+        return None
+    return Figure(
+        name="paths",
+        title="Trajectories, at the same scale",
+        caption="A square of ten by ten cell diameters, over two relaxation times where they are "
+        "known. Dots mark where the paths end.",
+        panels=tuple(panels),
+        data=pd.concat(parts, ignore_index=True),
+        wide=True,
+    )
+
+
+def add_sources(groups: Sequence[Group]) -> list[Group]:
+    """Add trajectories, masks and runs to the groups whose pictures will be shown."""
+    taken = {False: 0, True: 0}
+    out = []
+    for group in groups:
+        taken[group.simulated] += 1
+        if taken[group.simulated] > MAX_PICTURES:
+            out.append(group)
+            continue
+        first, *rest = group.trials.items()
+        head = (with_sources(first[1][0]), *first[1][1:])
+        out.append(replace(group, trials={first[0]: head, **dict(rest)}))
+    return out
+
+
+def with_pictures(groups: Sequence[Group]) -> list[Group]:
+    """The first few groups of each side that have something to show."""
+    shown = []
+    for simulated in (False, True):
+        shown += [g for g in groups if g.simulated is simulated][:MAX_PICTURES]
+    return [g for g in shown if g.members[0].tracks is not None]
+
+
+def _by_side(groups: Sequence[Group], measure: Measure) -> list[tuple[str, list[Curve]]]:
+    sides = []
+    for title, simulated in (("Experiment", False), ("Simulation", True)):
+        members = [(i, g) for i, g in enumerate(groups) if g.simulated is simulated]
+        curves: list[Curve] = []
+        for series, group in members[:MAX_CURVES]:
+            curves += measure(group, series)
+        if curves:
+            more = len(members) - MAX_CURVES
+            sides.append((f"{title} (first {MAX_CURVES})" if more > 0 else title, curves))
+    return sides
+
+
+def _scaled(table: str, *, by_tau: bool, by_area: bool = False) -> Measure:
+    def measure(group: Group, series: int) -> list[Curve]:
+        curve = group.curve(table, series=series)
+        scalars = group.scalars()
+        tau, d = scalars.get("tau_alpha.value"), scalars.get("wave_number.mean_diameter")
+        if curve is None or tau is None or not math.isfinite(tau.value):
+            return []
+        if by_area and d is None:
+            return []
+        unit = d.value**2 if by_area and d is not None else 1.0
+        error = None if curve.error is None else curve.error / unit
+        return [replace(curve, x=curve.x / tau.value, y=curve.y / unit, error=error)]
+
+    return measure
+
+
+def _paired(
+    sides: Sequence[tuple[str, Sequence[Curve]]],
+    *,
+    name: str,
+    title: str,
+    caption: str,
+    alt: str,
+    x: Scale,
+    y: Scale,
+    column: str,
+    marks: Sequence[Mark] = (),
+    own_time: Sequence[Group] = (),
+) -> Figure:
+    rows = max(count_legend_rows(curves) for _, curves in sides)
+    panels = []
+    for index, (side, curves) in enumerate(sides):
+        single = [c.label for c in curves if c.label]
+        panel_name = f"{name}-{index + 1}"
+        svg = draw_curves(
+            curves,
+            panel_name,
+            x=x,
+            y=y,
+            marks=marks,
+            legend_rows=rows,
+            top=_own_time(own_time, single[0]) if own_time and single else None,
+        )
+        label = f"{side}: {single[0]}" if len(single) == 1 else side
+        panels.append(Panel(panel_name, svg, f"{alt}; {side.lower()}.", label))
+    every = {f"{side}: {c.label}": c for side, curves in sides for c in curves if c.label}
+    return Figure(name, title, caption, tuple(panels), join_curves(every, column), wide=True)
+
+
+def _own_time(groups: Sequence[Group], label: str) -> tuple[float, str] | None:
+    for group in groups:
+        tau = group.scalars().get("tau_alpha.value")
+        if group.name == label and tau is not None and math.isfinite(tau.value):
+            return tau.value, f"t ({tau.unit}), {label}"
+    return None

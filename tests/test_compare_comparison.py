@@ -1,0 +1,249 @@
+"""Comparison: agreement, refusal to compare, pooling over trials, units, equal bytes."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compare_examples import make_layer
+from hypothesis import given
+from hypothesis import strategies as st
+
+import cellquant as cq
+from cellquant.compare.comparison import (
+    AGREE,
+    DIFFER,
+    NOT_COMPARABLE,
+    Matched,
+    judge,
+    matched_scalars,
+    unit_mapping,
+)
+from cellquant.compare.groups import read_groups
+from cellquant.compare.units import STERIC_AREA
+from cellquant.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def movie():
+    return make_layer(seed=1, n_frames=8)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make_layer(seed=2, n_frames=8, simulated=True, tau=200.0, shape=3.83)
+
+
+def write_study(folder: Path) -> Path:
+    """Two conditions with three trials, one of them with two stacks."""
+    for c, condition in enumerate(["untreated", "low nutrient"]):
+        for trial in range(3):
+            for stack in range(2 if trial == 0 else 1):
+                layer = make_layer(seed=trial, n_frames=3, side=5, size=80, tau=40 + 10 * c + trial)
+                layer.summary["shape_index"]["mean"] = 3.9 + 0.05 * c + 0.01 * trial + 0.04 * stack
+                layer.record["settings"] |= {"condition": condition, "trial": f"t{trial}"}
+                layer.write(folder / "stacks" / condition / f"t{trial}" / f"s{stack}")
+    (folder / "run.json").write_text(
+        json.dumps({"settings": {"condition": [{"name": "untreated"}, {"name": "low nutrient"}]}})
+    )
+    return folder
+
+
+def write_sweep(folder: Path) -> Path:
+    """A grid of two v0, two eta and two phi with two seeds each."""
+    for phi in (0.95, 0.97):
+        for v0 in (0.01, 0.03):
+            for eta in (0.01, 0.03):
+                for seed in (1, 2):
+                    layer = make_layer(
+                        seed=seed, n_frames=3, side=5, size=80, simulated=True, tau=6 * phi / v0
+                    )
+                    layer.summary["shape_index"]["mean"] = 3.7 + 3 * v0 - eta + 0.01 * seed
+                    scene = {"phi": phi, "v0": v0, "eta": eta}
+                    layer.record["settings"] |= {"scene": scene, "seed": seed}
+                    layer.write(folder / f"{phi}-{v0}-{eta}" / f"seed-{seed}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory) -> Path:
+    return write_study(tmp_path_factory.mktemp("study"))
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory) -> Path:
+    return write_sweep(tmp_path_factory.mktemp("sweep"))
+
+
+def number(value: float, error: float, **more: object) -> Matched:
+    return Matched("key", "label", value, error, "rule", **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "verdict"),
+    [
+        (number(3.9, 0.01), number(3.92, 0.01), AGREE),
+        (number(3.9, 0.01), number(3.94, 0.01), DIFFER),
+        (number(3.9, 0.0), number(3.9, 0.0), NOT_COMPARABLE),
+        (number(3.9, math.nan), number(3.9, 0.1), NOT_COMPARABLE),
+        (number(math.nan, 0.1), number(3.9, 0.1), NOT_COMPARABLE),
+        (number(3.9, 0.1, reason="no"), number(3.9, 0.1), NOT_COMPARABLE),
+        (number(1.0, 0.1, interval=0.1), number(1.0, 0.1, interval=0.12), AGREE),
+        (number(1.0, 0.1, interval=0.1), number(1.0, 0.1, interval=0.3), NOT_COMPARABLE),
+    ],
+)
+def test_verdicts(first: Matched, second: Matched, verdict: str) -> None:
+    found = judge(first, second)
+    assert found.verdict == verdict
+    assert bool(found.reason) == (verdict == NOT_COMPARABLE)
+
+
+@given(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 5), st.floats(0.01, 5))
+def test_verdict_does_not_depend_on_the_order(a: float, b: float, s: float, t: float) -> None:
+    one, other = judge(number(a, s), number(b, t)), judge(number(b, t), number(a, s))
+    assert one.verdict == other.verdict
+    assert one.difference == -other.difference
+
+
+def test_two_observables_in_one_line_as_the_readme_promises(movie, model, tmp_path: Path) -> None:
+    comparison = cq.compare(movie.result("movie"), model.result("model"))
+    comparison.to_html(tmp_path / "report.html")
+    comparison.to_json(tmp_path / "comparison.json")
+    again = cq.compare(movie.result("movie"), model.result("model"))
+    again.to_html(tmp_path / "again.html")
+    again.to_json(tmp_path / "again.json")
+    for name in ("report.html", "comparison.json"):
+        twin = name.replace("report", "again").replace("comparison", "again")
+        assert (tmp_path / name).read_bytes() == (tmp_path / twin).read_bytes()
+    content = json.loads((tmp_path / "comparison.json").read_text())
+    (pair,) = content["pairs"]
+    verdicts = {v["key"]: v["verdict"] for v in pair["verdicts"]}
+    assert verdicts["shape_index.mean"] == DIFFER
+    assert verdicts["van_hove.sigma2"] == AGREE
+    assert verdicts["tau_alpha.value"] == NOT_COMPARABLE
+    page = (tmp_path / "report.html").read_text()
+    assert len(page) < 1_000_000
+    ids = re.findall(r' id="([^"]*)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_matched_drawings_share_their_axes(movie, model, tmp_path: Path) -> None:
+    cq.compare(movie.result("movie"), model.result("model")).to_html(tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    for figure in ("shape-index", "self-intermediate-scattering", "van-hove"):
+        labels = []
+        for side in (1, 2):
+            start = page.index(f'data-name="{figure}-{side}"')
+            drawing = page[start : page.index("</svg>", start)]
+            texts = re.findall(r"<text[^>]*x=\"([\d.]*)\" y=\"([\d.]*)\"[^>]*>([^<]*)<", drawing)
+            bottom = [t for t in texts if float(t[1]) > 150]
+            labels.append(bottom)
+        assert labels[0] == labels[1]
+        assert labels[0]
+
+
+def test_unit_mapping_makes_diameters_and_relaxation_times_coincide(movie, model) -> None:
+    first, second = read_groups([movie.result("a"), model.result("b")])
+    mapping = unit_mapping(first, second)
+    assert mapping is not None
+    d = [layer.summary["wave_number"]["mean_diameter"] for layer in (movie, model)]
+    assert mapping.length == pytest.approx(d[0] / d[1])
+    assert mapping.length_error == pytest.approx(mapping.length * math.hypot(0.004, 0.004))
+    assert mapping.time == pytest.approx(40 / 200)
+    assert mapping.time_error == pytest.approx(mapping.time * math.hypot(0.06, 0.06))
+    assert unit_mapping(second, first) is None
+
+
+def test_effective_packing_fraction_is_that_of_the_area_and_of_the_scene(movie, model) -> None:
+    groups = read_groups([movie.result("a"), model.result("b")])
+    ours, theirs = (matched_scalars(g, area=STERIC_AREA)["packing_fraction"] for g in groups)
+    density = movie.summary["density"]["mean"]
+    assert ours.value == pytest.approx(density * 450)
+    assert ours.std_error == pytest.approx(ours.value * math.hypot(0.01, STERIC_AREA[1] / 450))
+    assert theirs.value == 0.97
+
+
+def test_trials_are_the_unit_of_replication(study: Path) -> None:
+    untreated, low = read_groups([study])
+    assert [g.name for g in (untreated, low)] == ["untreated", "low nutrient"]
+    assert untreated.n == 3
+    assert len(untreated.members) == 4
+    mean = untreated.scalars()["shape_index.mean"]
+    trials = np.array([3.9 + 0.02, 3.91, 3.92])  # the first trial has two stacks
+    assert mean.value == pytest.approx(trials.mean())
+    assert mean.std_error == pytest.approx(trials.std(ddof=1) / math.sqrt(3))
+    assert mean.n == "3 trials"
+
+
+def test_one_censored_trial_leaves_only_a_bound(study: Path, tmp_path: Path) -> None:
+    layer = make_layer(n_frames=3, side=5, size=80)
+    layer.summary["tau_alpha"] = {"value": None, "std_error": None, "censored_at": 500.0}
+    groups = []
+    for trial, tau in (("a", 700.0), ("b", None)):
+        layer.summary["tau_alpha"]["value"] = tau
+        layer.record["settings"] |= {"condition": "c", "trial": trial}
+        layer.write(tmp_path / "stacks" / trial)
+    (group,) = groups or read_groups([tmp_path])
+    tau = group.scalars()["tau_alpha.value"]
+    assert math.isnan(tau.value)
+    assert tau.censored_at == 500.0
+    assert "1 censored" in tau.n
+
+
+def test_study_against_sweep(study: Path, sweep: Path, tmp_path: Path) -> None:
+    comparison = cq.compare(study, sweep)
+    assert len(comparison.experiments) == 2
+    assert len(comparison.simulations) == 8
+    assert all(group.n == 2 for group in comparison.simulations)
+    comparison.to_html(tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert len(page) < 3_000_000
+    assert 'id="map-mean-shape-index"' in page
+    assert 'id="relaxation-times"' in page
+    assert "8 simulated scenes (16 runs)" in page
+    content = comparison.as_dict()
+    assert len(content["pairs"]) == 16
+    json.dumps(content, allow_nan=False)
+
+
+def test_experiments_alone_and_simulations_alone(study: Path, sweep: Path, tmp_path: Path) -> None:
+    for source, title in ((study, "Experiments side by side"), (sweep, "Simulations side by side")):
+        comparison = cq.compare(source)
+        assert len(comparison.pairs()) == len(comparison.groups) - 1
+        comparison.to_html(tmp_path / "r.html")
+        assert f"<title>{title}</title>" in (tmp_path / "r.html").read_text()
+
+
+def test_folder_brings_its_trajectories(movie, model, tmp_path: Path) -> None:
+    folder = movie.write(tmp_path / "movie")
+    movie.tracks.write(folder / "tracks.parquet")
+    cq.compare(folder, model.result("model")).to_html(tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert 'data-name="paths-1"' in page
+    assert 'data-name="paths-2"' in page
+
+
+def test_what_is_refused(movie, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needs two or more"):
+        cq.compare(movie.result("a"))
+    with pytest.raises(InputError, match=r"holds no summary\.json, nor does any folder below"):
+        cq.compare(movie.result("a"), tmp_path)
+    with pytest.raises(InputError, match="3 names are given for 2 results"):
+        cq.compare(movie.result("a"), movie.result("b"), names=["x", "y", "z"])
+    with pytest.raises(InputError, match="steric_area must be > 0"):
+        cq.compare(movie.result("a"), movie.result("b"), steric_area=(0.0, 1.0))
+
+
+def test_same_names_are_told_apart(movie) -> None:
+    groups = read_groups([movie.result("a"), movie.result("a")])
+    assert [g.name for g in groups] == ["a", "a (2)"]
+
+
+def test_equal_results_agree_in_everything_that_is_judged(movie) -> None:
+    comparison = cq.compare(movie.result("a"), movie.result("b"))
+    verdicts = comparison.verdicts(*comparison.groups)
+    judged = [v for v in verdicts if v.verdict != NOT_COMPARABLE]
+    assert len(judged) > 5
+    assert all(v.verdict == AGREE for v in judged)
