@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cellquant.storage import atomic_path
+from cellquant.storage import atomic_path, write_json
 from cellquant.tables import read_table, write_table
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ MAX_CURVES = 6
 def write_study(
     folder: Path, tasks: Sequence[Mapping[str, Any]], record: Mapping[str, Any]
 ) -> None:
-    """Write ``stacks.parquet``, ``relaxation_times.parquet`` and ``report.html`` of a study.
+    """Write a study's ``stacks.parquet``, ``relaxation_times.parquet``, statistics and report.
 
     Parameters
     ----------
@@ -38,18 +38,21 @@ def write_study(
         How the study was made: the content of ``run.json``.
     """
     from cellquant.compare.results import read_result
+    from cellquant.statistics import study_statistics
 
     results = [
         read_result(task["folder"], name=f"{task['condition']}, {task['trial']}, {task['name']}")
         for task in tasks
     ]
     units = results[0].units
+    stacks = stack_table(tasks, results)
     with atomic_path(folder / "stacks.parquet") as path:
-        write_table(stack_table(tasks, results), path, units=units)
+        write_table(stacks, path, units=units)
     times = relaxation_times(tasks)
     if times is not None:
         with atomic_path(folder / "relaxation_times.parquet") as path:
             write_table(times, path, units=units)
+        write_json(folder / "statistics.json", study_statistics(times, trial_values(stacks)))
     _write_report(folder / "report.html", tasks, results, record)
 
 
@@ -123,11 +126,37 @@ def relaxation_times(tasks: Sequence[Mapping[str, Any]]) -> "pd.DataFrame | None
                 "std_error": np.nan if censored else float(np.sqrt(variance)),
                 "censored": censored,
                 "censored_at": float(group["censored_at"].min()),
+                "below": float(group["below"].max()),
                 "n_stacks": len(group),
                 "n_windows": int(weight.sum()),
             }
         )
     return pd.DataFrame(rows)
+
+
+def trial_values(stacks: "pd.DataFrame") -> "pd.DataFrame":
+    """One row per trial and quantity, the mean over the trial's stacks, for tests of conditions.
+
+    A relaxation time that one of the stacks knows only as a bound is a bound for the trial.
+
+    Returns
+    -------
+    pandas.DataFrame
+        condition, trial, quantity, value, censored.
+    """
+    import pandas as pd
+
+    parts = []
+    for name in ("shape_index_mean", "shape_index_median", "speed_mean", "tau_alpha"):
+        bound = stacks["tau_alpha_censored_at"] if name == "tau_alpha" else stacks[name]
+        chosen = stacks.assign(
+            quantity=name,
+            censored=stacks[name].isna() & bound.notna(),
+            value=stacks[name].fillna(bound),
+        )
+        grouped = chosen.groupby(["condition", "trial", "quantity"], sort=False)
+        parts.append(grouped.agg({"value": "mean", "censored": "any"}).reset_index())
+    return pd.concat(parts, ignore_index=True)
 
 
 def _write_report(

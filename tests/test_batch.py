@@ -51,7 +51,7 @@ def study(tmp_path: Path) -> Path:
 
 def tables(folder: Path) -> dict[str, bytes]:
     """Content of every table and summary, which must not depend on time, machine or workers."""
-    kinds = ("*.parquet", "summary.json", "failures.json", "stacks/**/report.html")
+    kinds = ("*.parquet", "summary.json", "statistics.json", "stacks/**/report.html")
     files = sorted(path for kind in kinds for path in folder.rglob(kind))
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
@@ -65,6 +65,10 @@ def test_a_study_is_worked_through_once(study: Path, tmp_path: Path) -> None:
     assert stacks["condition"].tolist() == ["untreated", "untreated", "inhibitor"]
     assert np.allclose(stacks["shape_index_mean"], 2 * np.sqrt(np.pi), rtol=0.01)
     assert (out / "report.html").is_file()
+    times = pd.read_parquet(out / "relaxation_times.parquet")
+    assert {"condition", "trial", "bin_centre", "density", "tau_alpha", "censored"} <= set(times)
+    statistics = json.loads((out / "statistics.json").read_text())
+    assert {"mixed_model", "mann_whitney"} <= set(statistics)
     assert json.loads((out / "run.json").read_text())["counts"] == {"failed": 0, "stacks": 3}
     before = {path: path.stat().st_mtime_ns for path in (out / "stacks").rglob("*.parquet")}
 
