@@ -116,7 +116,7 @@ def test_ctc(tmp_path: Path, tracks: Tracks, masks: LabelStack) -> None:
         export_tracks(tracks, "ctc", tmp_path / "other")
 
 
-@pytest.mark.filterwarnings("ignore:Missing tag:UserWarning", "ignore:No image path:UserWarning")
+@pytest.mark.filterwarnings("ignore::UserWarning")  # what the file leaves out: image, display
 def test_trackmate_through_geff(tmp_path: Path, tracks: Tracks) -> None:
     """The converter of GEFF is an independent reader of TrackMate files."""
     geff = pytest.importorskip("geff")

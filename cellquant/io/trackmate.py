@@ -78,8 +78,13 @@ def write_trackmate(tracks: Tracks, path: Path, masks: LabelStack | None) -> Non
 
 
 def _attributes(values: dict[str, object]) -> str:
-    texts = {name: "NaN" if value != value else str(value) for name, value in values.items()}
-    return "".join(f" {name}={quoteattr(text)}" for name, text in texts.items())
+    return "".join(f" {name}={_quoted(value)}" for name, value in values.items())
+
+
+def _quoted(value: object) -> str:
+    if isinstance(value, str):
+        return quoteattr(value)
+    return '"NaN"' if value != value else f'"{value}"'
 
 
 def _open(tag: str, depth: int, **values: object) -> str:
