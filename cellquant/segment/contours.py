@@ -19,13 +19,13 @@ NEIGHBOUR_GAP = 3
 _MIN_AREA = 10
 _MIN_WIDTH = 2
 # Cracks beside one other label that make an arc of its own.
-_MIN_ARC = 4
+_MIN_ARC = 3
 # Cracks of the longest straight segment looked for; bounds the cost of long straight edges.
 _MAX_SEGMENT = 100
 # Largest turn at a junction, rad: a sharper tip has no finite mean loss.
 _MAX_TURN = 2.6
 # Part of the loss at a corner that segments fitted up to the corner leave unseen (measured).
-_CORNER_SHARE = 0.8
+_CORNER_SHARE = 0.65
 
 # Steps along a crack: right, down, left, up.
 _DX = np.array([1, 0, -1, 0])
