@@ -161,12 +161,22 @@ def test_mixed_types(tmp_path: Path) -> None:
         (["a1_2.tif", "a2_1.tif"], "2 numbers change"),
         (["t01.tif", "t1.tif"], "frame number 1 more than once"),
         (["t20260301120000.tif", "t20260301121000.tif", "t20260301131000.tif"], "too far apart"),
+        (["a.tif", "a.tiff"], "two files named a"),
+        (["man_track12345678.tif"], "too large"),
     ],
 )
 def test_unclear_numbers(tmp_path: Path, names: list[str], words: str) -> None:
     write_frames(tmp_path, names)
+    (tmp_path / "man_track.txt").write_text("1 0 0 0\n")
     with pytest.raises(InputError, match=words):
         read_labels(tmp_path)
+
+
+def test_a_pattern_over_several_folders(tmp_path: Path) -> None:
+    for name in ("p1", "p2"):
+        write_frames(tmp_path / name, ["t0.tif", "t1.tif"])
+    with pytest.raises(InputError, match="two files named t0"):
+        read_labels(f"{tmp_path}/*/t*.tif")
 
 
 def test_micro_sam_tracking_output(tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ LINEAGES = ("man_track.txt", "res_track.txt")
 _PICKLES = (".npy", ".npz", ".pkl", ".pickle")
 # Names whose numbers span more than this many times the number of files count no frames.
 _MAX_SPAN = 100
+# No frame has a number above this.
+_MAX_NUMBER = 10**6
 # Regular steps in the numbering are only taken for a numbering habit from this many files on.
 _MIN_REGULAR = 3
 
@@ -143,10 +145,10 @@ def _open_files(folder: Path, files: Sequence[Path]) -> Movie:
     raw, notes = _numbers(folder, files)
     listed = any((folder / name).is_file() for name in LINEAGES)
     numbers = raw if listed else _from_zero(raw, notes)
-    if numbers[-1] - numbers[0] >= _MAX_SPAN * len(files):
+    if numbers[-1] - numbers[0] >= _MAX_SPAN * len(files) or numbers[-1] > _MAX_NUMBER:
         raise InputError(
             f"{folder} has names such as {files[0].name} and {files[-1].name}, whose numbers are "
-            "too far apart to count frames; rename the files to frame numbers."
+            "too large or too far apart to count frames; rename the files to frame numbers."
         )
     _note_gaps(numbers, notes)
     first = open_tiff(files[0])
@@ -193,12 +195,20 @@ def _check_single(frame: TiffMovie, first: TiffMovie) -> None:
 def _natural(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts frame10 behind frame9."""
     parts = re.split(r"(\d+)", path.name)
-    return tuple((1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts)
+    return tuple(
+        (1, int(part), part) if place % 2 else (0, 0, part) for place, part in enumerate(parts)
+    )
 
 
 def _numbers(folder: Path, files: Sequence[Path]) -> tuple[list[int], list[str]]:
     """Number of each file as its name says: the one group of digits that changes."""
-    split = [re.split(r"(\d+)", file.stem) for file in files]
+    stems = [file.stem for file in files]
+    if len(set(stems)) < len(stems):
+        repeated = next(stem for stem in stems if stems.count(stem) > 1)
+        raise InputError(
+            f"{folder} holds two files named {repeated}; give the frames of one movie, each once."
+        )
+    split = [re.split(r"(\d+)", stem) for stem in stems]
     words = {tuple(parts[::2]) for parts in split}
     if len(words) > 1:
         if not any(len(parts) > 1 for parts in split):
