@@ -6,18 +6,19 @@ import numpy as np
 def drifting_discs(
     n_frames: int = 6,
     *,
-    size: int = 96,
+    side: int = 2,
     radius: float = 7.0,
     step: tuple[float, float] = (1.5, 0.5),
     dtype: type = np.uint16,
 ) -> np.ndarray:
-    """Four discs that keep their label and move by `step` px (x, y) per frame."""
+    """`side` x `side` discs that keep their label and move by `step` px (x, y) per frame."""
+    size = 40 * side + 16
     rows, columns = np.mgrid[:size, :size]
     movie = np.zeros((n_frames, size, size), dtype)
-    centres = [(24, 24), (24, 64), (64, 24), (64, 64)]
     for frame in range(n_frames):
-        for label, (row, column) in enumerate(centres, start=1):
-            y, x = row + frame * step[1], column + frame * step[0]
+        for label in range(1, side * side + 1):
+            y = 24 + 40 * ((label - 1) // side) + frame * step[1]
+            x = 24 + 40 * ((label - 1) % side) + frame * step[0]
             movie[frame][(rows - y) ** 2 + (columns - x) ** 2 <= radius**2] = label
     return movie
 
