@@ -9,8 +9,8 @@ _HOMES = {
     "Run": "run",
     "open_run": "run",
     "simulate": "run",
-    "render": "render",
-    "convergence": "convergence",
+    "render": "rendering",
+    "convergence": "workprecision",
 }
 
 __all__ = sorted(_HOMES)
@@ -27,8 +27,6 @@ def __getattr__(name: str) -> Any:
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'cellquant.sim' has no attribute {name!r}")
-    # The functions render and convergence bear the names of their modules; binding them here
-    # keeps `cellquant.sim.render` the function, however the module was imported.
     value = getattr(import_module(f"cellquant.sim.{home}"), name)
     globals()[name] = value
     return value

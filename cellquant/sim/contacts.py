@@ -162,13 +162,26 @@ class Layer:
         self.velocity(state, np.empty_like(state))
         return self._energy.copy()
 
-    def contacts(self) -> NDArray[np.int64]:
-        """Pairs (i, j) of cells that overlap in the last state evaluated, one row per image."""
+    def touching(self, state: Floats) -> NDArray[np.int64]:
+        """Pairs (i, j) of cells that overlap by the exact rule, (pairs, 2), one row per image."""
+        self.velocity(state, np.empty_like(state))
         first_cell = np.repeat(np.arange(len(self.radius)), np.diff(self._first))
         pairs = np.column_stack([first_cell, self._other])
-        if self.scene.rigid:
-            raise ValueError("contacts of rigid discs are not listed")
-        return pairs[(self._root_last > self._root_first) | (self._inside > 0)]
+        if not self.scene.rigid:
+            return pairs[(self._root_last > self._root_first) | (self._inside > 0)]
+        apart = state[pairs[:, 1], :2] + self._shift - state[pairs[:, 0], :2]
+        return pairs[np.hypot(*apart.T) < self.radius[pairs].sum(axis=1)]
+
+    def age_of_list(self) -> Floats:
+        """Centres and reach (N, 3) for which the neighbour list was made."""
+        if self._reference is None:
+            raise ValueError("the layer has not been evaluated yet")
+        return self._reference
+
+    def restore_list(self, reference: Floats) -> None:
+        """Make the neighbour list as it was, so that sums keep their order after a restart."""
+        self._record[:, [0, 1, 3]] = reference
+        self._rebuild()
 
     def _prepare(self, state: Floats, tension: tuple[int, ...]) -> None:
         if self.scene.rigid:

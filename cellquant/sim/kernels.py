@@ -57,8 +57,8 @@ def find_pairs(
     cutoff = 2.0 * largest + skin
     nx = max(1, min(int(lx / cutoff), 4096))
     ny = max(1, min(int(ly / cutoff), 4096))
-    rx = int(math.ceil(cutoff / (lx / nx)))
-    ry = int(math.ceil(cutoff / (ly / ny)))
+    rx = math.ceil(cutoff / (lx / nx))
+    ry = math.ceil(cutoff / (ly / ny))
     head = np.full(nx * ny, -1, np.int64)
     link = np.empty(n_cells, np.int64)
     wrap = np.empty((n_cells, 2), np.float64)
@@ -455,7 +455,7 @@ def crossings(
                     n_samples = size + 1
                 else:
                     centre = math.atan2(dy, dx) / spacing
-                    start = int(math.floor(centre - 0.5 * (n_samples - 1) + 0.5))
+                    start = math.floor(centre - 0.5 * (n_samples - 1) + 0.5)
                     start = (start + 2 * size) % size
                 mean_j = record[j, 2]
                 top = len(modes) - 1
@@ -500,26 +500,26 @@ def crossings(
                     depth[size] = depth[0]
                     change[size] = change[0]
                     largest = 0.0
-                    for l in range(size):
-                        largest = max(largest, abs(depth[l]))
+                    for s in range(size):
+                        largest = max(largest, abs(depth[s]))
                     if largest < 1e-12 * mean_j:
                         inside[p] = 1  # the same contour twice: i counts as inside j
                         continue
                 margin = HULL_MARGIN * mean_j
                 looks = 0
-                for l in range(n_samples - 1):
-                    g0 = depth[l]
-                    g1 = depth[l + 1]
-                    kind = variations(g0, g1, change[l], change[l + 1], spacing, margin)
+                for index in range(n_samples - 1):
+                    g0 = depth[index]
+                    g1 = depth[index + 1]
+                    kind = variations(g0, g1, change[index], change[index + 1], spacing, margin)
                     if kind == 0:
                         continue
-                    s = (start + l) % size
+                    s = (start + index) % size
                     stack[0, 0] = 0.0
                     stack[0, 1] = spacing
                     stack[0, 2] = g0
                     stack[0, 3] = g1
-                    stack[0, 4] = change[l]
-                    stack[0, 5] = change[l + 1]
+                    stack[0, 4] = change[index]
+                    stack[0, 5] = change[index + 1]
                     height = 1
                     while height > 0:
                         height -= 1
@@ -763,18 +763,18 @@ def exact_velocity(
                 cos_n, sin_n = cos_n * cos_1 - sin_n * sin_1, sin_n * cos_1 + cos_n * sin_1
                 jr = mean * wr[n]
                 ji = mean * wi[n]
-                for l in range(len(modes)):
-                    cr = 0.5 * record[i, HEAD + l]
-                    ci = 0.5 * record[i, HEAD + len(modes) + l]
-                    up = n + l + 2
+                for q in range(len(modes)):
+                    cr = 0.5 * record[i, HEAD + q]
+                    ci = 0.5 * record[i, HEAD + len(modes) + q]
+                    up = n + q + 2
                     jr += cr * wr[up] - ci * wi[up]
                     ji += cr * wi[up] + ci * wr[up]
-                    if l <= m:
-                        jr += cr * wr[m - l] + ci * wi[m - l]
-                        ji += cr * wi[m - l] - ci * wr[m - l]
+                    if q <= m:
+                        jr += cr * wr[m - q] + ci * wi[m - q]
+                        ji += cr * wi[m - q] - ci * wr[m - q]
                     else:
-                        jr += cr * wr[l - m] - ci * wi[l - m]
-                        ji -= cr * wi[l - m] + ci * wr[l - m]
+                        jr += cr * wr[q - m] - ci * wi[q - m]
+                        ji -= cr * wi[q - m] + ci * wr[q - m]
                 area += record[i, HEAD + m] * jr - record[i, HEAD + len(modes) + m] * ji
                 jr *= k
                 ji *= k
@@ -869,7 +869,7 @@ def quadrature_velocity(
                     n_chunks = (size + LANES - 1) // LANES
                 else:
                     centre = math.atan2(dy, dx) / spacing
-                    start = int(math.floor(centre - 0.5 * (n_chunks * LANES - 1) + 0.5))
+                    start = math.floor(centre - 0.5 * (n_chunks * LANES - 1) + 0.5)
                     start = (start + 2 * size) % size
                 mean_j = record[j, 2]
                 top = len(modes) - 1

@@ -1,0 +1,310 @@
+"""A run on disk: a zarr group that grows frame by frame and can be read meanwhile."""
+
+import json
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import zarr
+from numpy.typing import NDArray
+
+from cellquant import __version__
+from cellquant.errors import InputError
+from cellquant.sim.scene import Scene
+from cellquant.sim.shapes import measure_shapes
+from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
+
+Floats = NDArray[np.float64]
+CHECKPOINT = "checkpoint.npz"
+CHUNK = 262_144  # numbers of a chunk: what one write of a growing run touches
+
+
+def create_group(path: Path | None, scene: Scene, settings: dict[str, Any]) -> zarr.Group:
+    """Make an empty run on disk, or in memory where the path is None."""
+    store = zarr.storage.MemoryStore() if path is None else zarr.storage.LocalStore(path)
+    group = zarr.create_group(store, zarr_format=3)
+    n_cells, n_modes = scene.n_cells, scene.modes - 1
+    for name, shape in (
+        ("time", ()),
+        ("position", (n_cells, 2)),
+        ("polarity", (n_cells,)),
+        ("modes", (n_cells, 2, n_modes)),
+    ):
+        per_frame = max(1, int(np.prod(shape)))
+        group.create_array(
+            name,
+            shape=(0, *shape),
+            chunks=(min(4096, max(1, CHUNK // per_frame)), *(max(1, n) for n in shape)),
+            dtype="float64",
+            fill_value=np.nan,
+        )
+    group.attrs.update(
+        {
+            "format": "cellquant run",
+            "version": __version__,
+            "length_unit": REDUCED.length,
+            "time_unit": REDUCED.time,
+            "scene": scene.to_dict(),
+            "settings": settings,
+            "status": "running",
+            "failure": None,
+        }
+    )
+    return group
+
+
+def write_constants(group: zarr.Group, radius: Floats, box: Floats) -> None:
+    """Store what does not change with time."""
+    for name, values in (("radius", radius), ("box", box)):
+        group.create_array(name, shape=values.shape, dtype="float64")[:] = values
+
+
+def open_group(path: Path, mode: str = "r") -> zarr.Group:
+    """Open the group of a run; `InputError` where the folder is none."""
+    try:
+        group = zarr.open_group(zarr.storage.LocalStore(path, read_only=mode == "r"), mode=mode)
+        known = group.attrs.get("format") == "cellquant run" and "box" in group
+    except (OSError, ValueError, KeyError, json.JSONDecodeError) as error:
+        raise InputError(
+            f"{path} is not a readable run ({str(error).splitlines()[0]}); "
+            "make one with 'cellquant simulate -o RUN.zarr'."
+        ) from error
+    if not known:
+        raise InputError(
+            f"{path} is a zarr group but no run of cellquant, or its first frame was not written "
+            "yet; make one with 'cellquant simulate -o RUN.zarr'."
+        )
+    return group
+
+
+def append_frames(group: zarr.Group, start: int, times: Floats, states: Floats) -> None:
+    """Write frames from index `start` on; what stood there, after a kill, is overwritten."""
+    stop = start + len(times)
+    n_modes = (states.shape[2] - 3) // 2
+    shapes = states[:, :, 3:].reshape(len(states), states.shape[1], 2, n_modes)
+    columns = {"position": states[:, :, :2], "polarity": states[:, :, 2], "modes": shapes}
+    # The time comes last: a frame counts only once its time is there.
+    for name, values in (*columns.items(), ("time", times)):
+        array = group[name]
+        array.resize((stop, *array.shape[1:]))
+        if values.size:
+            array[start:stop] = values
+
+
+def write_checkpoint(path: Path, **arrays: Any) -> None:
+    """Replace the checkpoint of a run in one move."""
+    partial = path / (CHECKPOINT + ".partial")
+    with open(partial, "wb") as file:
+        np.savez(file, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path / CHECKPOINT)
+
+
+def read_checkpoint(path: Path) -> dict[str, Any] | None:
+    """Read the checkpoint of a run, None where there is none."""
+    if not (path / CHECKPOINT).is_file():
+        return None
+    with np.load(path / CHECKPOINT, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+@dataclass(frozen=True)
+class Stationarity:
+    """Result of `Run.stationarity`.
+
+    Attributes
+    ----------
+    stationary
+        Whether the drift is within twice its standard error.
+    drift, std_error
+        Mean of <p> over the second half of the run minus that over the first, and its error from
+        blocks.
+    n_blocks
+        Blocks per half.
+    """
+
+    stationary: bool
+    drift: float
+    std_error: float
+    n_blocks: int
+
+
+class Run:
+    """A simulated run, in memory or on disk, finished or growing.
+
+    Attributes
+    ----------
+    path
+        Where the run is stored, None in memory.
+    """
+
+    def __init__(self, group: zarr.Group, path: Path | None = None) -> None:
+        self._group = group
+        self.path = path
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene that was simulated."""
+        return Scene.from_dict(dict(self._group.attrs["scene"]))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Contact rule, integrator, step, frame interval, transient, duration, version."""
+        return dict(self._group.attrs["settings"])
+
+    @property
+    def status(self) -> str:
+        """``running`` (or interrupted), ``complete`` or ``failed``."""
+        return str(self._group.attrs["status"])
+
+    @property
+    def failure(self) -> dict[str, Any] | None:
+        """Reason, remedy, cell, time and step where the run failed."""
+        found = self._group.attrs["failure"]
+        return None if found is None else dict(found)
+
+    @property
+    def work(self) -> dict[str, Any]:
+        """Steps, force evaluations, rejected steps and seconds of CPU time spent."""
+        return dict(self._group.attrs.get("work", {}))
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames written so far."""
+        return len(self.time)
+
+    @property
+    def time(self) -> Floats:
+        """(T,) time of the frames since the end of the transient, t0."""
+        times = np.asarray(self._group["time"][:], np.float64)
+        return times[: int(np.argmax(np.isnan(times)))] if np.isnan(times).any() else times
+
+    @property
+    def position(self) -> Floats:
+        """(T, N, 2) unwrapped centres, L0."""
+        return self._frames("position")
+
+    @property
+    def polarity(self) -> Floats:
+        """(T, N) polarity angles, radians, not wrapped."""
+        return self._frames("polarity")
+
+    @property
+    def modes(self) -> Floats:
+        """(T, N, 2, M - 1) coefficients a_n and b_n, n = 2 .. M."""
+        return self._frames("modes")
+
+    @cached_property
+    def radius(self) -> Floats:
+        """(N,) radii R0_i, L0."""
+        return np.asarray(self._group["radius"][:], np.float64)
+
+    @cached_property
+    def box(self) -> tuple[float, float]:
+        """Edges of the periodic box, L0."""
+        edges = np.asarray(self._group["box"][:], np.float64)
+        return float(edges[0]), float(edges[1])
+
+    def _frames(self, name: str) -> Floats:
+        return np.asarray(self._group[name][: self.n_frames], np.float64)
+
+    def state(self, frame: int) -> Floats:
+        """State rows x, y, theta, a_2 .. a_M, b_2 .. b_M of one frame."""
+        frame = range(self.n_frames)[frame]
+        modes = np.asarray(self._group["modes"][frame], np.float64)
+        polarity = np.asarray(self._group["polarity"][frame], np.float64)
+        position = np.asarray(self._group["position"][frame], np.float64)
+        return np.column_stack([position, polarity, modes.reshape(len(modes), -1)])
+
+    def mean_shape_index(self) -> Floats:
+        """(T,) mean over the cells of p = P / sqrt(A), from the true contours."""
+        modes, polarity = self.modes, self.polarity
+        return np.array(
+            [
+                measure_shapes(modes[t], polarity[t], self.radius)["shape_index"].mean()
+                for t in range(self.n_frames)
+            ]
+        )
+
+    def stationarity(self, n_blocks: int = 5) -> Stationarity:
+        """Test whether <p> still drifts: the halves of the run against their block errors.
+
+        The difference of the two halves' means is compared with the standard error that `n_blocks`
+        blocks per half give; a run is taken for stationary where it is within two errors.
+
+        Raises
+        ------
+        InputError
+            If the run has fewer than four frames per block.
+        """
+        series = self.mean_shape_index()
+        length = len(series) // (2 * n_blocks)
+        if length < 4:
+            raise InputError(
+                f"a test of stationarity needs {8 * n_blocks} frames, the run has {len(series)}; "
+                "simulate for longer or save more often."
+            )
+        blocks = series[-2 * n_blocks * length :].reshape(2, n_blocks, length).mean(axis=2)
+        drift = float(blocks[1].mean() - blocks[0].mean())
+        error = float(np.sqrt(np.sum(blocks.var(axis=1, ddof=1)) / n_blocks))
+        return Stationarity(abs(drift) <= 2.0 * error, drift, error, n_blocks)
+
+    def to_tracks(self) -> Tracks:
+        """The run as tracks, measured on the true contours, in reduced units.
+
+        Label and track_id are the index of the cell plus one; x, y the unwrapped centres;
+        n_neighbours counts the cells whose contours overlap; no cell touches a border.
+        """
+        n_cells, n_frames = len(self.radius), self.n_frames
+        if n_frames == 0:
+            raise InputError(f"{self.path or 'the run'} holds no frame yet; simulate for longer.")
+        times, position = self.time, self.position
+        modes, polarity = self.modes, self.polarity
+        neighbours = self._count_neighbours()
+        frames = []
+        for t in range(n_frames):
+            table = measure_shapes(modes[t], polarity[t], self.radius)
+            table = table.drop(columns=["offset_x", "offset_y"])
+            table["x"], table["y"] = position[t, :, 0], position[t, :, 1]
+            table["frame"] = t
+            table["label"] = np.arange(1, n_cells + 1)
+            table["n_neighbours"] = neighbours[t]
+            frames.append(table)
+        table = pd.concat(frames, ignore_index=True)
+        table["touches_border"] = False
+        table["track_id"] = table["label"]
+        table["parent_track_id"] = 0
+        table["time"] = times[table["frame"].to_numpy()]
+        table = table.sort_values(["track_id", "frame"], ignore_index=True)
+        table = table[list(TRACK_COLUMNS)].astype(dict(TRACK_COLUMNS))
+        return Tracks(
+            table=table,
+            units=REDUCED,
+            frame_interval=float(self.settings["save_every"]),
+            area=self.box[0] * self.box[1],
+            box=self.box,
+            provenance={
+                "source": "simulation",
+                "scene": self.scene.to_dict(),
+                "settings": self.settings,
+                "status": self.status,
+            },
+        )
+
+    def _count_neighbours(self) -> NDArray[np.int64]:
+        from cellquant.sim.contacts import Layer
+
+        layer = Layer(self.scene, self.radius, np.array(self.box))
+        counts = np.zeros((self.n_frames, len(self.radius)), np.int64)
+        for t in range(self.n_frames):
+            pairs = layer.touching(self.state(t))
+            pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+            if len(pairs):
+                pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+                counts[t] = np.bincount(pairs.ravel(), minlength=len(self.radius))
+        return counts

@@ -1,0 +1,231 @@
+"""Runs: resuming, streaming, failing, and what they become as tracks."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from cellquant.errors import InputError
+from cellquant.sim import Scene, SimulationFailure, open_run, simulate
+from cellquant.sim import run as run_module
+from cellquant.sim.noise import BrownianTree
+from cellquant.tables import REDUCED
+
+SMALL = Scene(n_cells=9, phi=0.9)
+
+
+def same(a, b):
+    for name in ("time", "position", "polarity", "modes"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+
+
+def test_frames_have_the_layout_of_the_contract(tmp_path):
+    run = simulate(SMALL, duration=3, transient=1, dt=0.02, output=tmp_path / "run.zarr")
+    assert run.status == "complete"
+    assert run.time == pytest.approx([0, 1, 2, 3])
+    assert run.position.shape == (4, 9, 2)
+    assert run.polarity.shape == (4, 9)
+    assert run.modes.shape == (4, 9, 2, 5)
+    assert run.radius.shape == (9,)
+    assert len(run.box) == 2
+    assert run.settings["dt"] == pytest.approx(0.02)
+    assert Scene.from_dict(run.scene.to_dict()) == SMALL
+    assert run.work["evaluations"] > 0
+
+
+def test_interrupted_run_resumes_bitwise(tmp_path, monkeypatch):
+    whole = simulate(SMALL, duration=6, transient=1, dt=0.02, output=tmp_path / "whole.zarr")
+    monkeypatch.setattr(run_module, "CHECKPOINT_EVERY", 0.0)
+
+    class Stop(Exception):
+        pass
+
+    def stop_at(limit):
+        def progress(done, total):
+            if done == limit:
+                raise Stop
+
+        return progress
+
+    for limit in (1, 2, 4, 6):
+        with pytest.raises(Stop):
+            simulate(
+                SMALL, duration=6, transient=1, dt=0.02, output=tmp_path / "parts.zarr",
+                progress=stop_at(limit),
+            )  # fmt: skip
+        assert open_run(tmp_path / "parts.zarr").status == "running"
+    parts = simulate(SMALL, duration=6, transient=1, dt=0.02, output=tmp_path / "parts.zarr")
+    assert parts.status == "complete"
+    same(whole, parts)
+    again = simulate(SMALL, duration=6, transient=1, dt=0.02, output=tmp_path / "parts.zarr")
+    same(whole, again)
+    same(whole, simulate(SMALL, duration=6, transient=1, dt=0.02))
+
+
+@pytest.mark.slow
+def test_killed_run_resumes_bitwise(tmp_path):
+    code = (
+        "import sys; from cellquant.sim import Scene, simulate; "
+        "import cellquant.sim.run as r; r.CHECKPOINT_EVERY = 0.0; "
+        "simulate(Scene(n_cells=9, phi=0.9), duration=400, dt=0.01, output=sys.argv[1])"
+    )
+    path = tmp_path / "run.zarr"
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", code, str(path)])
+        start = len(open_run(path).time) if path.exists() else 0
+        for _ in range(600):
+            time.sleep(0.1)
+            if (path / "checkpoint.npz").exists() and open_run(path).n_frames > start + 5:
+                break
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert open_run(path).to_tracks().table["frame"].max() > start
+    resumed = simulate(Scene(n_cells=9, phi=0.9), duration=400, dt=0.01, output=path)
+    same(resumed, simulate(Scene(n_cells=9, phi=0.9), duration=400, dt=0.01))
+
+
+@pytest.mark.slow
+def test_threads_do_not_change_the_run(tmp_path):
+    code = (
+        "import sys; from cellquant.sim import Scene, simulate; "
+        "simulate(Scene(n_cells=100), duration=2, dt=0.02, output=sys.argv[1])"
+    )
+    for threads in (1, 2):
+        environment = {**os.environ, "NUMBA_NUM_THREADS": str(threads)}
+        command = [sys.executable, "-c", code, str(tmp_path / f"{threads}.zarr")]
+        subprocess.run(command, check=True, env=environment)
+    same(open_run(tmp_path / "1.zarr"), open_run(tmp_path / "2.zarr"))
+
+
+def test_other_settings_are_not_mixed_into_a_run(tmp_path):
+    simulate(SMALL, duration=1, dt=0.02, output=tmp_path / "run.zarr")
+    with pytest.raises(InputError, match="another v0"):
+        simulate(SMALL.replace(v0=0.1), duration=1, dt=0.02, output=tmp_path / "run.zarr")
+    with pytest.raises(InputError, match="another duration"):
+        simulate(SMALL, duration=2, dt=0.02, output=tmp_path / "run.zarr")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").write_text("mine")
+    with pytest.raises(InputError, match="is no run"):
+        simulate(SMALL, duration=1, output=tmp_path / "other")
+    with pytest.raises(InputError, match="does not exist"):
+        open_run(tmp_path / "absent.zarr")
+    with pytest.raises(InputError):
+        open_run(tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"duration": 0.0}, {"duration": np.inf}, {"duration": 1.0, "transient": -1.0},
+        {"duration": 1.0, "dt": 0.0}, {"duration": 1.0, "save_every": -2.0},
+        {"duration": 1.0, "integrator": "magic"}, {"duration": 1.0, "contact": "soft"},
+        {"duration": 1.0, "contact": "quadrature", "points": 7},
+        {"duration": 1.0, "integrator": "euler", "tolerance": 1e-3},
+    ],
+)  # fmt: skip
+def test_wrong_options_are_refused(options):
+    with pytest.raises(InputError):
+        simulate(SMALL, **options)
+
+
+def test_too_long_a_step_stops_with_the_partial_run(tmp_path):
+    scene = Scene(n_cells=36)
+    with pytest.raises(SimulationFailure, match=r"smaller dt") as caught:
+        simulate(scene, duration=50, integrator="euler", dt=0.2, output=tmp_path / "run.zarr")
+    failure = caught.value
+    assert failure.run.n_frames >= 1
+    assert failure.step > 0
+    stored = open_run(tmp_path / "run.zarr")
+    assert stored.status == "failed"
+    assert stored.failure["remedy"] == failure.remedy
+    assert np.isfinite(stored.position).all()
+
+
+def test_tracks_carry_the_true_contours():
+    run = simulate(Scene(n_cells=16), duration=2, dt=0.02)
+    tracks = run.to_tracks()
+    table = tracks.table
+    assert tracks.units == REDUCED
+    assert tracks.box == run.box
+    assert tracks.area == pytest.approx(np.prod(run.box))
+    assert tracks.frame_interval == 1.0
+    assert len(table) == 3 * 16
+    assert table["area"].to_numpy() == pytest.approx(np.repeat(np.pi * run.radius**2, 3))
+    assert (table["shape_index"] >= 2 * np.sqrt(np.pi) - 1e-12).all()
+    first = table[table["track_id"] == 5]
+    assert first[["x", "y"]].to_numpy() == pytest.approx(run.position[:, 4])
+    assert first["time"].to_numpy() == pytest.approx(run.time)
+    assert 3 < table["n_neighbours"].mean() <= 6
+
+
+def test_brownian_tree_is_one_path_at_every_depth():
+    tree = BrownianTree(3, 2000, 0.8)
+    top_w, top_h = (x.copy() for x in tree.level(5, 0))
+    for depth in (1, 3, 6):
+        w, h = tree.level(5, depth)
+        length = 0.8 / 2**depth
+        assert w.sum(axis=0) == pytest.approx(top_w[0], abs=1e-12)
+        # Area of the root from the parts: H T = sum over parts of (W_start + w/2 + h) dt - W T/2.
+        start = np.cumsum(w, axis=0) - w
+        area = np.sum((start + 0.5 * w + h) * length, axis=0) / 0.8 - 0.5 * top_w[0]
+        assert area == pytest.approx(top_h[0], abs=1e-12)
+        assert w.var() == pytest.approx(length, rel=0.1)
+        assert h.var() == pytest.approx(length / 12, rel=0.1)
+    tree.level(6, 2)
+    again = BrownianTree(3, 2000, 0.8)
+    assert np.array_equal(again.level(5, 6)[0], tree.level(5, 6)[0])
+
+
+def test_free_cell_walks_persistently():
+    """MSD of an active Brownian particle: 2 v0^2/D^2 (D t - 1 + exp(-D t))."""
+    scene = Scene(n_cells=400, phi=0.0005, v0=0.3, D_r=0.5, mu_theta=0.0, modes=1, eta=0.0)
+    run = simulate(scene, duration=8, dt=0.02)
+    moved = run.position[-1] - run.position[0]
+    squares = np.sum(moved**2, axis=1)
+    x = 0.5 * 8
+    expected = 2 * (0.3 / 0.5) ** 2 * (x - 1 + np.exp(-x))
+    assert squares.mean() == pytest.approx(expected, abs=4 * squares.std() / 20)
+
+
+def test_shape_modes_relax_as_linear_theory_says():
+    """d a_n/dt = -mu_ab eta pi R0 (n^2 - 1) a_n for a nearly round cell at constant area."""
+    scene = Scene(n_cells=1, phi=0.05, v0=0.0, D_r=0.0, eta=0.2, mu_ab=0.5, polydispersity=0.0)
+    from cellquant.sim.contacts import Layer
+    from cellquant.sim.initial import initial_state
+
+    state, radius, box = initial_state(scene)
+    layer = Layer(scene, radius, box)
+    out = np.empty_like(state)
+    for mode in range(2, 7):
+        for column in (1 + mode, 6 + mode):
+            moved = state.copy()
+            moved[0, column] = 1e-5
+            layer.velocity(moved, out)
+            rate = 0.5 * 0.2 * np.pi * 0.5 * (mode**2 - 1)
+            assert out[0, column] == pytest.approx(-rate * 1e-5, rel=1e-5)
+
+
+def test_passive_layer_never_gains_energy():
+    from cellquant.sim.contacts import Layer
+
+    scene = Scene(n_cells=36, v0=0.0, D_r=0.0, phi=1.0)
+    run = simulate(scene, duration=10, dt=0.005, save_every=0.25)
+    layer = Layer(scene, run.radius, np.array(run.box))
+    energy = [layer.energies(run.state(t)).sum() for t in range(run.n_frames)]
+    assert (np.diff(energy) < 1e-9).all()
+    assert energy[-1] < 0.9 * energy[0]
+
+
+def test_two_cells_head_on_stop_where_push_and_drive_balance():
+    """Two rigid discs that drive against each other rest at the chord c = v0 / (mu_r k)."""
+    scene = Scene(
+        n_cells=2, box=(10, 10), radii=(0.5, 0.5), positions=((4, 5), (5.2, 5)),
+        polarities=(0.0, np.pi), v0=0.2, D_r=0.0, mu_theta=0.0, modes=1, eta=0.0,
+    )  # fmt: skip
+    run = simulate(scene, duration=20, dt=0.01)
+    distance = np.linalg.norm(run.position[-1, 1] - run.position[-1, 0])
+    assert distance == pytest.approx(2 * np.sqrt(0.25 - 0.1**2), rel=1e-6)
