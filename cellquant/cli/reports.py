@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cellquant.cli.console import note, say, step
+from cellquant.cli.console import note, say, say_json, step
 
 
 class ConfigKind(StrEnum):
@@ -47,6 +47,51 @@ def run(
         raise typer.Exit(2 if outcome.only_input_errors else 1)
 
 
+def compare(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Results to compare: folders of observe, run or sweep; experiments and runs.",
+            metavar="EXPERIMENT_DIR SIMULATION_DIR...",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The HTML page; comparison.json goes beside it.")
+    ],
+) -> None:
+    """Put experiments and simulations side by side: a report, and comparison.json beside it."""
+    from cellquant.compare import compare as compare_results
+    from cellquant.storage import check_output
+
+    check_output(output.parent)
+    with step("compare"):
+        comparison = compare_results(*sources)
+        comparison.to_html(output)
+        comparison.to_json(output.with_name("comparison.json"))
+    for first, second in comparison.pairs():
+        verdicts = comparison.verdicts(first, second)
+        counts = {v.verdict: 0 for v in verdicts}
+        for verdict in verdicts:
+            counts[verdict.verdict] += 1
+        found = ", ".join(f"{count} {word}" for word, count in counts.items())
+        say(f"{first.name} and {second.name}: {found}")
+    note(f"wrote {output} and {output.with_name('comparison.json')}")
+
+
+def convert_units(
+    file: Annotated[Path, typer.Argument(help="TOML file with [measured] and/or [reduced].")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
+) -> None:
+    """Turn measured quantities into reduced parameters and back, with propagated errors."""
+    from cellquant.compare.units import convert_units_file, render_units
+
+    converted = convert_units_file(file)
+    if json:
+        say_json(converted)
+    else:
+        say(render_units(converted))
+
+
 config = typer.Typer(help="Configuration files.", no_args_is_help=True)
 
 
@@ -64,4 +109,6 @@ def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
     app.command()(demo)
     app.command()(run)
+    app.command()(compare)
+    app.command()(convert_units)
     app.add_typer(config, name="config")
