@@ -316,7 +316,7 @@ def overlap(
     -------
     Overlap
         Errors of Q: jackknife over blocks of tracks. Errors of chi_4: jackknife over stretches
-        of time origins, each at least t long; NaN when fewer than 5 such stretches fit. chi_4 is
+        of time origins, each at least 2 t long; NaN when fewer than 4 such stretches fit. chi_4 is
         undefined (NaN) when no two origins lie t apart, that is for t beyond half the movie.
 
     References
@@ -347,8 +347,8 @@ def _susceptibility(inside: FloatArray, pairs: FloatArray, lag: int) -> tuple[fl
     value = _lagged_variance(series, lag)
     n_cells = float(pairs[origins].mean())
     span = int(origins[-1] - origins[0]) + 1
-    stretches = min(20, span // lag)
-    if stretches < 5:
+    stretches = min(20, span // (2 * lag))
+    if stretches < 4:
         return n_cells * value, np.nan
     replicates = np.empty(stretches)
     edges = origins[0] + np.arange(stretches + 1) * span // stretches

@@ -74,12 +74,10 @@ def _pair_counts(
 ) -> None:
     for k in prange(offsets.size - 1):
         a, length = offsets[k], offsets[k + 1] - offsets[k]
-        n_valid = 0
-        for i in range(length):
-            n_valid += valid[a + i]
+        whole = stride == 1 and np.all(valid[a : a + length])
         for m in range(lags.size):
             lag = lags[m]
-            if n_valid == length and stride == 1:
+            if whole:
                 out[k, m] = max(length - lag, 0)
                 continue
             n = 0
@@ -102,6 +100,7 @@ def _moments(
     for k in prange(offsets.size - 1):
         a, length = offsets[k], offsets[k + 1] - offsets[k]
         xs, ys, ok = x[a : a + length], y[a : a + length], valid[a : a + length]
+        whole = stride == 1 and np.all(ok)
         for m in range(lags.size):
             lag = lags[m]
             n = max(length - lag, 0)
@@ -110,12 +109,19 @@ def _moments(
             x0, y0, ok0 = xs[:n], ys[:n], ok[:n]
             x1, y1, ok1 = xs[lag:], ys[lag:], ok[lag:]
             s2, s4 = 0.0, 0.0
-            for i in range(0, n, stride):
-                dx, dy = x1[i] - x0[i], y1[i] - y0[i]
-                r2 = dx * dx + dy * dy
-                r2 = r2 if ok0[i] & ok1[i] else 0.0
-                s2 += r2
-                s4 += r2 * r2
+            if whole:
+                for i in range(n):
+                    dx, dy = x1[i] - x0[i], y1[i] - y0[i]
+                    r2 = dx * dx + dy * dy
+                    s2 += r2
+                    s4 += r2 * r2
+            else:
+                for i in range(0, n, stride):
+                    if ok0[i] & ok1[i]:
+                        dx, dy = x1[i] - x0[i], y1[i] - y0[i]
+                        r2 = dx * dx + dy * dy
+                        s2 += r2
+                        s4 += r2 * r2
             second[k, m] = s2
             fourth[k, m] = s4
 
