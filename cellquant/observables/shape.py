@@ -135,6 +135,8 @@ def _empty() -> pd.DataFrame:
 def _bandwidth(values: FloatArray) -> float:
     low, high = np.quantile(values, (0.25, 0.75))
     spread = float(np.std(values))
+    if not spread > 1e-12 * float(np.abs(values).max()):
+        return 0.0  # equal but for round-off
     robust = min(spread, float(high - low) / 1.349) or spread
     return float(0.9 * robust * values.size ** (-0.2))
 
@@ -157,7 +159,7 @@ def _fine_counts(parts: list[FloatArray], bandwidth: float) -> tuple[FloatArray,
     """Counts of each part on a grid of a tenth of the bandwidth (at most 4096 points)."""
     low = min(float(p.min()) for p in parts) - 4 * bandwidth
     high = max(float(p.max()) for p in parts) + 4 * bandwidth
-    if bandwidth <= 0 or not high > low:
+    if bandwidth <= 0:
         return np.array([low]), np.array([[float(p.size)] for p in parts])
     n = int(np.clip(np.ceil((high - low) / (0.1 * bandwidth)), 64, 4096))
     edges = np.linspace(low, high, n + 1)
