@@ -78,8 +78,8 @@ def test_numbers_behind_a_figure_are_those_of_the_table(layer: Layer, tmp_path: 
     np.testing.assert_allclose(data["lag_time"], table["lag_time"], rtol=1e-5)
     np.testing.assert_allclose(data["value"], table["value"], rtol=1e-5)
     density = csv_of(page, "density")
-    assert (density["cells"] == 81).all()
-    np.testing.assert_allclose(density["density"], 81e6 / layer.tracks.area, rtol=1e-5)
+    assert (density["n_cells"] == 81).all()
+    np.testing.assert_allclose(density["count_per_area"], 81e6 / layer.tracks.area, rtol=1e-5)
 
 
 def test_everything_from_outside_is_escaped(layer: Layer, tmp_path: Path) -> None:

@@ -281,6 +281,7 @@ def _draw_mark(axes: "Axes", mark: Mark) -> None:
         ha="right" if right else "left",
         fontsize=9,
         color=shade,
+        bbox={"facecolor": colour("ground"), "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
     )
     text.set_gid("mark")
 
@@ -293,6 +294,13 @@ def _set_scales(axes: "Axes", x: Scale, y: Scale) -> None:
         (y, axes.yaxis, axes.set_yscale, axes.set_ylim),
     ):
         axis.set_label_text(scale.label)
+        if axis is axes.yaxis:
+            # At a fixed distance from the edge, whatever the width of the numbers.
+            figure = axes.get_figure(root=True)
+            assert figure is not None
+            place = axes.get_position()
+            centre = place.y0 + place.height / 2
+            axis.set_label_coords(0.2 / figure.get_figwidth(), centre, transform=figure.transFigure)
         if scale.log:
             set_scale("log")
         if scale.limits is not None:

@@ -173,7 +173,7 @@ def _plain(value: float, digits: int) -> str:
 
 
 def flatten(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Nested settings as (dotted name, text) in the order given; numbers in full precision."""
+    """Nested settings as (dotted name, text) in the order given."""
     entries: list[tuple[str, str]] = []
     for key, value in settings.items():
         if isinstance(value, Mapping):
@@ -185,14 +185,19 @@ def flatten(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
         elif isinstance(value, bool):
             entries.append((str(key), "yes" if value else "no"))
         elif isinstance(value, Sequence) and not any(isinstance(v, Mapping) for v in value):
-            entries.append((str(key), ", ".join(str(v) for v in value) or "none"))
+            entries.append((str(key), ", ".join(_digits(v) for v in value) or "none"))
         elif isinstance(value, Sequence):
             for number, item in enumerate(value, start=1):
                 inner = item if isinstance(item, Mapping) else {"": item}
                 entries += [(f"{key} {number}.{n}".rstrip("."), t) for n, t in flatten(inner)]
         else:
-            entries.append((str(key), str(value)))
+            entries.append((str(key), _digits(value)))
     return tuple(entries)
+
+
+def _digits(value: Any) -> str:
+    """A number as it was given, or to six digits where it was computed."""
+    return f"{value:.6g}" if isinstance(value, float) and len(repr(value)) > 9 else str(value)
 
 
 def _marked(text: str) -> Any:

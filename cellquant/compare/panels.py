@@ -1,6 +1,7 @@
 """The figures of the reports: what is drawn of a layer, and what each figure says in words."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,13 +42,13 @@ def masks_figure(
         identities=identities,
     )
     count = int(np.unique(labels[labels > 0]).size)
-    time = number * tracks.frame_interval
+    time, unit = number * tracks.frame_interval, tracks.units.time
+    moment = "" if unit == "frame" else f" (t = {time:g} {pretty_unit(unit)})"
     shown = "Outlines of the cells on the recorded image" if raw is not None else "Label masks"
     return Figure(
         name="segmented-frame",
         title="Segmented frame",
-        caption=f"{shown} of frame {number} (t = {time:g} {pretty_unit(tracks.units.time)}), "
-        f"{count} cells.",
+        caption=f"{shown} of frame {number}{moment}, {count} cells.",
         panels=(
             Panel(
                 "segmented-frame",
@@ -62,22 +63,15 @@ def masks_figure(
 
 def density_figure(tracks: "Tracks", cells: "Cells | None") -> Figure:
     """Number of cells and number density of every frame."""
-    import pandas as pd
+    from cellquant.observables.windows import density_per_frame
 
-    table = tracks.table if cells is None else cells.table
-    last_frame = int(table["frame"].max())
-    whole = cells is not None and cells.n_frames > last_frame
-    frames = np.arange(cells.n_frames if cells is not None and whole else last_frame + 1)
-    if not whole:
-        frames = frames[int(table["frame"].min()) :]
-    counts = table.groupby("frame").size().reindex(frames, fill_value=0).to_numpy(np.float64)
-    area = np.full(frames.size, tracks.area)
-    if cells is not None and whole:
-        area = cells.occupied_area
+    data = density_per_frame(tracks if cells is None else cells)
     scale, unit = scale_of((-2, 0), tracks.units)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        density = np.asarray(scale * counts / area, dtype=np.float64)
-    time = np.asarray(frames * tracks.frame_interval, dtype=np.float64)
+    data["density"] *= scale
+    data["count_per_area"] *= scale
+    data.insert(1, "time", data["frame"] * tracks.frame_interval)
+    time, density = (data[name].to_numpy(np.float64) for name in ("time", "density"))
+    counts = data["n_cells"].to_numpy()
     svg = draw_curves(
         [Curve("", time, density)],
         "density",
@@ -88,8 +82,8 @@ def density_figure(tracks: "Tracks", cells: "Cells | None") -> Figure:
     return Figure(
         name="density",
         title="Density while it was filmed",
-        caption="Cells per area that cells can occupy, frame by frame; between "
-        f"{int(counts.min())} and {int(counts.max())} cells.",
+        caption="Cells per area that cells can occupy, frame by frame; a cell cut by the border "
+        f"counts one half. Between {int(counts.min())} and {int(counts.max())} cells in view.",
         panels=(
             Panel(
                 "density",
@@ -97,7 +91,7 @@ def density_figure(tracks: "Tracks", cells: "Cells | None") -> Figure:
                 f"Density against time, from {format_value(first)} to {format_value(last)} {unit}.",
             ),
         ),
-        data=pd.DataFrame({"frame": frames, "time": time, "cells": counts, "density": density}),
+        data=data,
     )
 
 
@@ -192,13 +186,22 @@ def msd_figure(results: Sequence[Result]) -> Figure | None:
     unit = unit_text((2, 0), results[0].units)
     first = drawn[0]
     good = np.isfinite(first.y) & (first.y > 0) & (first.x > 0)
-    guides = []
+    guides: list[Curve] = []
+    if len(drawn) == 1:
+        drawn = [replace(first, label="measured")]
     if good.sum() > 3:
         lag, value = first.x[good], first.y[good]
         middle = len(lag) // 2
         span = np.geomspace(lag[middle], lag[-1], 20)
         guides.append(
-            Curve("slope 1", span, 0.55 * value[middle] * span / lag[middle], None, 4, "dashes")
+            Curve(
+                "slope 1: diffusion",
+                span,
+                0.55 * value[middle] * span / lag[middle],
+                None,
+                4,
+                "dashes",
+            )
         )
     svg = draw_curves(
         [*drawn, *guides],
@@ -236,7 +239,8 @@ def paths_figure(tracks: "Tracks") -> Figure | None:
         thin_paths(near, max_points=4000), "trajectories-zoom", units=tracks.units, window=zoom
     )
     shown = paths["track_id"].nunique()
-    part = "" if shown == tracks.n_tracks else f" {shown} of {tracks.n_tracks} tracks are drawn."
+    several = int((table["track_id"].value_counts() > 1).sum())
+    part = "" if shown == several else f" {shown} of {several} tracks are drawn, the longest."
     return Figure(
         name="trajectories",
         title="Trajectories",

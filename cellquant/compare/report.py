@@ -42,12 +42,13 @@ _HEADLINES = ("density.mean", "shape_index.mean", "tau_alpha.value", "speed.mean
 # What the counts of faults mean, in words; others are listed under their own name.
 _FAULTS = {
     "fragments": "labels in several pieces: the largest piece was measured",
-    "holes": "labels with a hole: the hole was filled for the contour",
-    "specks": "pieces of a few pixels, left out",
-    "border": "cells cut by the edge of the image: tracked, but left out of the shape index",
-    "duplicate_frames": "frames equal to the one before",
+    "specks": "pieces of a few pixels: left out",
+    "holes": "cells with a hole: the hole was filled for the contour",
+    "enclosed_cells": "cells inside another cell",
+    "border_cells": "cells cut by the edge of the image: tracked, but left out of all shapes",
+    "too_small_for_contour": "cells too small for a contour: tracked, but left out of all shapes",
+    "duplicated_frames": "frames equal to the one before",
     "empty_frames": "frames without a cell",
-    "missing_frames": "frame numbers without a file",
 }
 
 
@@ -190,6 +191,11 @@ def _lede(tracks: "Tracks", result: Result) -> str:
     length, time = pretty_unit(tracks.units.length), pretty_unit(tracks.units.time)
     mean = result.summary.get("n_cells_mean")
     count = f"{mean:.0f} cells in each of {frames} frames" if mean else f"{frames} frames"
+    if tracks.units.length == "px":
+        return (
+            f"{count}, followed as {tracks.n_tracks} tracks. The recording has no calibration: "
+            "lengths are in pixels (px), times in frames."
+        )
     return (
         f"{count}, one every {tracks.frame_interval:g} {time}, followed as {tracks.n_tracks} "
         f"tracks. Lengths are in {length}, times in {time}."

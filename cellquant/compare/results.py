@@ -287,7 +287,7 @@ def read_scalars(result: Result) -> list[Scalar]:
                 value=factor * value,
                 std_error=factor * _number(look_up(result.summary, entry.error_key)),
                 unit=unit,
-                n=_sample(entry.key, count, group, result.summary),
+                n=_sample(entry.key, count, result.summary),
                 rule=_rule(entry, group),
                 power=entry.power,
                 censored_at=censored,
@@ -309,6 +309,8 @@ def scale_of(power: tuple[int, int], units: Units) -> tuple[float, str]:
     """Factor and unit in which a quantity is shown: number densities per mm^2, not per um^2."""
     if power == (-2, 0) and units.length == "um":
         return 1e6, "1/mm^{2}"
+    if power == (-2, 0) and units.length == "px":
+        return 1e6, "per million px^{2}"
     return 1.0, unit_text(power, units)
 
 
@@ -335,17 +337,15 @@ def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) and value is not None else math.nan
 
 
-def _sample(key: str, count: Any, group: Any, summary: Mapping[str, Any]) -> str:
+def _sample(key: str, count: Any, summary: Mapping[str, Any]) -> str:
     if isinstance(count, int):
         return f"{count} cells"
-    if key.startswith("density"):
-        return f"{summary.get('n_frames')} frames"
-    if isinstance(group, Mapping):
-        for name, noun in (("n_pairs", "displacements"), ("n", ""), ("n_tracks", "tracks")):
-            if isinstance(group.get(name), int):
-                return f"{group[name]} {noun}".strip()
-    tracks = summary.get("n_tracks")
-    return f"{tracks} tracks" if tracks else f"{summary.get('n_frames')} frames"
+    group = key.split(".")[0]
+    frames = f"{summary.get('n_frames')} frames"
+    if group in {"density", "wave_number"}:
+        return frames
+    retained = look_up(summary, "processing.n_tracks_retained") or summary.get("n_tracks")
+    return f"{retained} tracks" if retained else frames
 
 
 def _rule(entry: _Entry, group: Any) -> str:
@@ -360,7 +360,8 @@ def _rule(entry: _Entry, group: Any) -> str:
     method = group.get("std_error_method") if isinstance(group, Mapping) else None
     if isinstance(method, str) and entry.error_key:
         text += f"; error: {method}"
-    return text
+    note = group.get("note") if isinstance(group, Mapping) else None
+    return f"{text}; {note}" if isinstance(note, str) else text
 
 
 def curve_of(
