@@ -12,8 +12,10 @@ from cellquant.errors import InputError
 from cellquant.storage import RunRecord, atomic_path, check_output
 
 if TYPE_CHECKING:
+    from cellquant.config import SceneConfig
     from cellquant.io import ImageStack, LabelStack
     from cellquant.observables import Observables
+    from cellquant.sim import Run
     from cellquant.tables import Cells, Tracks
 
 Progress = Callable[[int, int], None]
@@ -113,6 +115,43 @@ def _calibration(masks: "LabelStack") -> dict[str, Any]:
         "time_unit": calibration.units.time,
         "calibration_source": calibration.source,
     }
+
+
+def simulate_scene(config: "SceneConfig", out: str | Path | None, *, step: Step = silent) -> "Run":
+    """Simulate the layer of a scene file into a run on disk, or go on with an unfinished one.
+
+    Parameters
+    ----------
+    config
+        The scene with its run: transient, duration, contact rule, integrator.
+    out
+        Path of the run, e.g. ``RUN.zarr``; None to keep it in memory.
+    step
+        Gives a progress callback that counts simulated time in t0.
+
+    Raises
+    ------
+    InputError
+        If the scene is impossible, an option is wrong, or the output cannot be written.
+    """
+    from cellquant.sim import Scene, simulate
+
+    if out is not None:
+        check_output(Path(out).parent)
+    with step("simulate") as progress:
+        return simulate(
+            Scene.from_config(config),
+            duration=config.duration,
+            transient=config.transient,
+            contact=config.contact,
+            points=config.points,
+            integrator=config.integrator,
+            dt=config.dt,
+            tolerance=config.tolerance,
+            save_every=config.save_every,
+            output=out,
+            progress=progress,
+        )
 
 
 def open_source(

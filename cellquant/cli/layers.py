@@ -44,6 +44,7 @@ def simulate(
     save_every: Annotated[float | None, typer.Option(help="Time between saved states, t0.")] = None,
 ) -> None:
     """Simulate one layer; run the same command again to resume one that was interrupted."""
+    from cellquant.cli.text import run_lines
     from cellquant.config import SceneConfig, load, read_toml, validate
     from cellquant.pipeline import simulate_scene
 
@@ -70,7 +71,7 @@ def simulate(
     content |= {key: value for key, value in given.items() if value is not None}
     config = validate(content, SceneConfig, where=str(scene or "options"))
     run = simulate_scene(config, output, step=lambda label: step(label, unit="t0"))
-    for line in run.as_lines():
+    for line in run_lines(run):
         say(line)
     note(f"wrote {output}")
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cellquant.io import LabelStack
+    from cellquant.sim import Run
     from cellquant.tables import Cells, Tracks
 
 
@@ -98,3 +99,26 @@ def summary_lines(summary: Mapping[str, Any]) -> list[str]:
             f"over {speed['dt']:g} {time}"
         )
     return lines
+
+
+def run_lines(run: "Run") -> list[str]:
+    """What a simulated run is, what it cost, and whether it may be averaged."""
+    from cellquant.errors import InputError
+
+    scene, settings, work = run.scene, run.settings, run.work
+    lines = [
+        f"scene: {scene.n_cells} cells, phi {scene.phi:g}, v0 {scene.v0:g}, eta {scene.eta:g}",
+        f"box: {run.box[0]:.4f} x {run.box[1]:.4f} L0",
+        f"scheme: {settings['integrator']}, step {settings['dt']:g} t0, "
+        f"{settings['contact']} contacts",
+        f"saved: {run.n_frames} states, one every {settings['save_every']:g} t0, "
+        f"after {settings['transient']:g} t0",
+    ]
+    lines += [f"{name.replace('_', ' ')}: {value:.6g}" for name, value in sorted(work.items())]
+    try:
+        found = run.stationarity()
+    except InputError as error:
+        return [*lines, f"stationarity: not tested ({error})"]
+    verdict = "no drift seen" if found.stationary else "NOT STATIONARY, do not average"
+    drift = with_error(found.drift, found.std_error)
+    return [*lines, f"stationarity: {verdict} (<p> changed by {drift} between the halves)"]
