@@ -81,6 +81,20 @@ def test_ome_units(
     assert "OME" in found.source
 
 
+@pytest.mark.parametrize(
+    ("moments", "interval"),
+    [([0, 601, 1200, 1799, 2400], 10), ([0, 600, 1200, 1800, 9000], None), ([0] * 5, None)],
+)
+def test_ome_times_of_planes(tmp_path: Path, moments: list[float], interval: float | None) -> None:
+    plane = {"DeltaT": moments}
+    if interval is None:
+        with pytest.raises(InputError, match="frame interval"):
+            ome(tmp_path / "m.tif", PhysicalSizeX=0.65, PhysicalSizeY=0.65, Plane=plane)
+    else:
+        found = ome(tmp_path / "m.tif", PhysicalSizeX=0.65, PhysicalSizeY=0.65, Plane=plane)
+        assert found.frame_interval == pytest.approx(interval, rel=0.01)
+
+
 def test_options_override_the_file(tmp_path: Path) -> None:
     imagej(tmp_path / "m.tif", resolution=(2, 2), unit="um", finterval=60)
     found = read_labels(tmp_path / "m.tif", pixel_size=0.9).calibration

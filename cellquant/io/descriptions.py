@@ -11,13 +11,17 @@ import json
 import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 from cellquant.errors import InputError
 from cellquant.io.calibration import Metadata, micrometres_per, minutes_per
 
 # Pixels whose edges differ by more than this fraction are not square.
 _SQUARE = 1e-3
+# Intervals between planes that differ by more than this fraction are not regular.
+_REGULAR = 0.1
 _EXPORT = "export one channel of one plane per time point"
 
 
@@ -180,6 +184,8 @@ def _ome(path: Path, text: str) -> Layout:
     interval = _number(pixels.get("TimeIncrement", ""))
     minutes = minutes_per(pixels.get("TimeIncrementUnit", "s"))
     interval = None if interval is None or minutes is None else interval * minutes
+    if interval is None and axis == "T":
+        interval = _interval_of_planes(pixels)
     metadata = Metadata(pixel_size, interval, "OME metadata", problem)
     return Layout(n_planes, axis + "YX", order, None, metadata, "OME")
 
@@ -220,6 +226,27 @@ def _ome_order(
             "export the file again."
         )
     return tuple(pages[plane] for plane in range(n_planes))
+
+
+def _interval_of_planes(pixels: ElementTree.Element) -> float | None:
+    """Time between planes in min where each states when it was taken, at regular intervals."""
+    moments: dict[int, float] = {}
+    for plane in pixels:
+        minutes = minutes_per(plane.get("DeltaTUnit", "s"))
+        if _name(plane) != "Plane" or minutes is None:
+            continue
+        try:
+            moments[int(plane.get("TheT", ""))] = float(plane.get("DeltaT", "")) * minutes
+        except ValueError:
+            return None
+    times = [moments[number] for number in sorted(moments)]
+    steps = [after - before for before, after in pairwise(times)]
+    if not steps or sorted(moments) != list(range(len(moments))):
+        return None
+    middle = median(steps)
+    regular = math.isfinite(middle) and middle > 0
+    regular = regular and all(abs(step - middle) <= _REGULAR * middle for step in steps)
+    return middle if regular else None
 
 
 def _name(element: ElementTree.Element) -> str:
