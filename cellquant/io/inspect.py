@@ -19,6 +19,8 @@ _MIN_PAIRS = 3
 _MAX_CHANCE = 0.5
 # So many recurring labels make a single pair of frames worth a judgement of its own.
 _MIN_PAIRS_OF_FRAME = 6
+# So many pieces per label are no segmentation.
+_IMAGE_AT = 10
 FAULTS = (
     "fragments",
     "specks",
@@ -168,7 +170,7 @@ class Inspection:
 
     def _calibration_text(self) -> str:
         if self.calibration is None:
-            return f"none ({self.calibration_problem})"
+            return f"none ({self.calibration_problem.removeprefix(self.path or '').lstrip(': ')})"
         c = self.calibration
         return (
             f"{c['pixel_size']:g} {c['length_unit']} per px, {c['frame_interval']:g} "
@@ -248,6 +250,9 @@ def inspect_labels(
     totals["empty_frames"] = len(empty)
     totals["duplicated_frames"] = len(duplicated)
     totals["vanished_frames"] = len(vanished)
+    notes = stack.notes
+    if totals["fragments"] + totals["specks"] > _IMAGE_AT * sum(counts):
+        notes += ("labels lie in many pieces each: this looks like images, not label masks",)
     calibration, problem = _calibration(stack)
     return Inspection(
         path=None if stack.path is None else str(stack.path),
@@ -266,7 +271,7 @@ def inspect_labels(
         duplicated_frames=tuple(duplicated),
         vanished_frames=tuple(vanished),
         fragmented=tuple(fragmented[:20]),
-        notes=stack.notes,
+        notes=notes,
     )
 
 
