@@ -16,7 +16,7 @@ from cellquant.observables.smoothing import FloatArray, IntArray
 from cellquant.observables.trajectories import Trajectories
 
 CORE_REACH = 1.5  # the core ends at this many standard deviations
-TAIL_START = 3.0  # and the tail begins at this many
+TAIL_EXCESS = 10.0  # the tail begins where it holds this many times what the core predicts
 MIN_TAIL = 30
 NORMALISATIONS = {
     "areal": "2 pi int G_s r dr = 1: probability per area",
@@ -91,16 +91,19 @@ def self_van_hove(
     unit
         Length in which r is expressed, e.g. the mean cell diameter.
     core_range
-        Range of r, in the unit; from 0 to 1.5 sigma, found by iteration, when None.
+        Range of r, in the unit; from 0 to 1.5 sigma, found in four steps from the median,
+        when None.
     tail_range
-        Range of r, in the unit; from 3 sigma to the largest displacement when None.
+        Range of r, in the unit; from where it holds ten times what the core predicts, at
+        least 2 sigma, to the largest displacement when None.
 
     Returns
     -------
     VanHove
-        No core when nothing moves; no tail with fewer than 30 displacements there, or fewer
-        than twice what the core predicts (the distribution is Gaussian as far as it is known).
-        Bias: a broad tail reaches into the core's range and makes sigma larger.
+        No core when nothing moves; no tail where no range holds ten times what the core
+        predicts and 30 displacements (the distribution is Gaussian as far as it is known).
+        Bias: a broad tail reaches into the core's range and makes sigma larger; up to a tenth
+        of an automatic tail belongs to the core, which makes xi shorter by a few per cent.
 
     References
     ----------
@@ -141,14 +144,12 @@ def _fit_core(
     low, high = given or (0.0, 0.0)
     if given is None:
         high = CORE_REACH * np.sqrt(np.median(square) / (2 * np.log(2)))
-        for _ in range(50):
+        for _ in range(3):
             inside = square <= high**2
             sigma2 = _truncated_scale(float(square[inside].mean()), 0.0, high**2) / 2
             if not np.isfinite(sigma2):
                 break
-            change, high = abs(CORE_REACH * np.sqrt(sigma2) - high), CORE_REACH * np.sqrt(sigma2)
-            if change < 1e-6 * high:
-                break
+            high = CORE_REACH * np.sqrt(sigma2)
     inside = (square >= low**2) & (square <= high**2)
     count = np.bincount(block[inside], weights=np.ones(inside.sum()), minlength=n)
     total = np.bincount(block[inside], weights=square[inside], minlength=n)
@@ -187,7 +188,13 @@ def _fit_tail(
         fits["tail_reason"] = "the tail is placed by the width of the core, which is not known"
         return
     largest = float(r.max())
-    low, high = given or (TAIL_START * float(np.sqrt(sigma2)), np.inf)
+    low, high = given or (_tail_start(r, fits), np.inf)
+    if not np.isfinite(low):
+        fits["tail_reason"] = (
+            f"nowhere does the distribution hold {TAIL_EXCESS:g} times what its Gaussian core "
+            f"predicts, with {MIN_TAIL} displacements beyond"
+        )
+        return
     inside = (r >= low) & (r <= high)
     count = np.bincount(block[inside], weights=np.ones(inside.sum()), minlength=n)
     total = np.bincount(block[inside], weights=r[inside], minlength=n)
@@ -196,20 +203,24 @@ def _fit_tail(
     if count.sum() < MIN_TAIL:
         fits["tail_reason"] = f"fewer than {MIN_TAIL} displacements lie in the tail"
         return
-    if sigma2 is not None:
-        start, stop = fits["core_range"]
-        law = [np.exp(-(x**2) / (2 * sigma2)) for x in (start, stop, low)]
-        predicted = fits["core_n"] / (law[0] - law[1]) * law[2]
-        fits["tail_excess"] = float(count.sum() / predicted) if predicted > 0 else None
-        if given is None and count.sum() < 2 * predicted:
-            fits["tail_reason"] = "the tail holds less than twice what the Gaussian core predicts"
-            return
     best = _tail_length(float(total.sum() / count.sum()), low, high)
     if not np.isfinite(best):
         fits["tail_reason"] = "the tail does not fall off inside its range"
         return
     fits["xi"] = best
     fits["xi_std_error"] = _error(total, count, lambda m: _tail_length(m, low, high))
+
+
+def _tail_start(r: FloatArray, fits: dict[str, Any]) -> float:
+    """First r, in tenths of sigma from two on, beyond which the core explains a tenth at most."""
+    sigma2 = fits["sigma2"]
+    start, stop = fits["core_range"]
+    share = np.exp(-(start**2) / (2 * sigma2)) - np.exp(-(stop**2) / (2 * sigma2))
+    places = np.sqrt(sigma2) * (2 + 0.1 * np.arange(61))
+    beyond = r.size - np.searchsorted(np.sort(r), places)
+    predicted = fits["core_n"] / share * np.exp(-(places**2) / (2 * sigma2))
+    good = np.flatnonzero((beyond >= TAIL_EXCESS * predicted) & (beyond >= MIN_TAIL))
+    return float(places[good[0]]) if good.size else float("inf")
 
 
 def _tail_length(mean: float, low: float, high: float) -> float:
