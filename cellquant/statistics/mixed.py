@@ -100,9 +100,12 @@ class _Reml:
         """Minus twice the restricted log-likelihood, profiled over beta and sigma."""
         log_det, information, _, residual = self.solve(theta)
         free = self.n - 2
+        volume = float(np.linalg.det(information))
+        if not volume > 0:  # random effects so large that nothing is left in double precision
+            return float("inf")
         return float(
             log_det
-            + np.log(np.linalg.det(information))
+            + np.log(volume)
             + free * (1 + np.log(2 * np.pi * max(residual, 1e-300) / free))
         )
 
