@@ -8,11 +8,10 @@ done again, and one whose configuration or input has changed is.
 import glob
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from cellquant.config import ConditionConfig, ExperimentConfig, TrialConfig, load
-from cellquant.engines import Outcome, Task, execute
+from cellquant.engines import BatchOutcome, Task, run_tasks
 from cellquant.errors import InputError
 from cellquant.storage import (
     RunRecord,
@@ -23,31 +22,9 @@ from cellquant.storage import (
     only_writer,
     write_json,
 )
+from cellquant.study import write_study
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class StudyOutcome:
-    """What a batch did.
-
-    Attributes
-    ----------
-    folder
-        The output folder.
-    done, skipped
-        Number of stacks worked on now, and finished by an earlier run.
-    failures
-        Reason by stack, for those that failed.
-    only_input_errors
-        Whether every failure is one of the input, none of the program.
-    """
-
-    folder: Path
-    done: int
-    skipped: int
-    failures: dict[str, str] = field(default_factory=dict)
-    only_input_errors: bool = True
 
 
 def find_stacks(config: ExperimentConfig, base: Path) -> list[Task]:
@@ -78,6 +55,7 @@ def find_stacks(config: ExperimentConfig, base: Path) -> list[Task]:
                     )
                 tasks.append(
                     {
+                        "label": f"{condition.name}/{trial.name}/{stack.stem}",
                         "condition": condition.name,
                         "trial": trial.name,
                         "name": stack.stem,
@@ -163,7 +141,7 @@ def run_experiment(
     workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
-) -> StudyOutcome:
+) -> BatchOutcome:
     """Work through an experiment file: every stack, then the study's tables and report.
 
     Parameters
@@ -190,7 +168,7 @@ def run_experiment(
     record = RunRecord("run", config.model_dump())
     record.add_input(path)
     folder.mkdir(parents=True, exist_ok=True)
-    with only_writer(folder), record.stage("stacks"):
+    with only_writer(folder):
         for task in tasks:
             task["key"] = content_key(
                 {
@@ -200,46 +178,21 @@ def run_experiment(
                 }
             )
             task["folder"] = str(task_folder(folder, task))
-        waiting = [t for t in tasks if finished_key(Path(t["folder"]), "run") != t["key"]]
-        outcomes: list[Outcome] = []
-        for outcome in execute(work_on_stack, waiting, workers=workers, scheduler=scheduler):
-            outcomes.append(outcome)
-            if progress is not None:
-                progress(len(tasks) - len(waiting) + len(outcomes), len(tasks))
-    failures = {
-        _label(waiting[outcome.index]): outcome.error
-        for outcome in sorted(outcomes, key=lambda o: o.index)
-        if outcome.error is not None
-    }
-    record.counts = {"stacks": len(tasks), "failed": len(failures)}
-    record.notes = [f"{name}: {reason}" for name, reason in failures.items()]
-    with only_writer(folder):
+        with record.stage("stacks"):
+            outcome = run_tasks(
+                work_on_stack,
+                tasks,
+                command="run",
+                workers=workers,
+                scheduler=scheduler,
+                on_finished=progress,
+            )
+        record.counts = {"stacks": len(tasks), "failed": len(outcome.failures)}
+        record.notes = [f"{name}: {reason}" for name, reason in outcome.failures.items()]
         finished = [t for t in tasks if finished_key(Path(t["folder"]), "run") == t["key"]]
         if finished:
-            from cellquant.study import write_study
-
             with record.stage("study"):
                 write_study(folder, finished, record.as_dict())
-        write_json(folder / "failures.json", failures)
+        write_json(folder / "failures.json", outcome.failures)
         record.write(folder)
-    return StudyOutcome(
-        folder,
-        done=len(waiting) - len(failures),
-        skipped=len(tasks) - len(waiting),
-        failures=failures,
-        only_input_errors=all(o.is_input_error for o in outcomes if o.error is not None),
-    )
-
-
-def _label(task: Task) -> str:
-    return f"{task['condition']}/{task['trial']}/{task['name']}"
-
-
-def describe(outcome: StudyOutcome) -> list[str]:
-    """Lines for the terminal: what was done, what was there already, what failed and why."""
-    lines = [
-        f"stacks: {outcome.done} done, {outcome.skipped} finished before, "
-        f"{len(outcome.failures)} failed"
-    ]
-    lines += [f"failed: {name}: {reason}" for name, reason in outcome.failures.items()]
-    return lines
+    return outcome

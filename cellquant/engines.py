@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from cellquant.errors import InputError
+from cellquant.storage import finished_key
 
 Task = dict[str, Any]
 TRIES = 3
@@ -39,6 +40,73 @@ class Outcome:
     index: int
     error: str | None = None
     is_input_error: bool = False
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """What a batch of resumable tasks came to.
+
+    Attributes
+    ----------
+    done, skipped
+        Number of tasks worked on now, and finished by an earlier call.
+    failures
+        Reason by label, for those that failed.
+    only_input_errors
+        Whether every failure is one of the input, none of the program.
+    """
+
+    done: int
+    skipped: int
+    failures: dict[str, str]
+    only_input_errors: bool
+
+    def as_lines(self, noun: str) -> list[str]:
+        """What was done, what was there already, what failed and why."""
+        return [
+            f"{noun}: {self.done} done, {self.skipped} finished before, "
+            f"{len(self.failures)} failed",
+            *(f"failed: {name}: {reason}" for name, reason in self.failures.items()),
+        ]
+
+
+def run_tasks(
+    function: Callable[[Task], None],
+    tasks: Sequence[Task],
+    *,
+    command: str,
+    workers: int = 1,
+    scheduler: str | None = None,
+    on_finished: Callable[[int, int], None] | None = None,
+) -> BatchOutcome:
+    """Run those tasks whose finished work is not there yet.
+
+    Parameters
+    ----------
+    function, workers, scheduler
+        See `execute`.
+    tasks
+        Each with ``key``, ``folder`` and ``label``; finished is a task whose folder holds a
+        manifest of `command` with its key.
+    command
+        Name in the manifests.
+    on_finished
+        Called with (tasks finished, tasks in all) whenever one has ended.
+    """
+    waiting = [t for t in tasks if finished_key(Path(t["folder"]), command) != t["key"]]
+    skipped = len(tasks) - len(waiting)
+    outcomes: list[Outcome] = []
+    for outcome in execute(function, waiting, workers=workers, scheduler=scheduler):
+        outcomes.append(outcome)
+        if on_finished is not None:
+            on_finished(skipped + len(outcomes), len(tasks))
+    failed = sorted((o for o in outcomes if o.error is not None), key=lambda o: o.index)
+    return BatchOutcome(
+        done=len(waiting) - len(failed),
+        skipped=skipped,
+        failures={waiting[o.index]["label"]: str(o.error) for o in failed},
+        only_input_errors=all(o.is_input_error for o in failed),
+    )
 
 
 def execute(

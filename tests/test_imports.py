@@ -28,6 +28,7 @@ ALLOWED: dict[str, set[str]] = {
     "study": FOUNDATION | {"observables", "statistics", "compare"},
     "batch": FOUNDATION
     | {"observables", "segment", "track", "sim", "compare", "pipeline", "engines", "study"},
+    "sweep": FOUNDATION | {"observables", "sim", "pipeline", "engines"},
     "demo": FOUNDATION | {"observables", "segment", "track", "sim", "compare", "pipeline"},
 }
 FORBIDDEN = {"napari", "PyQt5", "PyQt6", "PySide2", "PySide6", "qtpy", "pickle", "shelve"}

@@ -35,13 +35,13 @@ def run(
     ] = None,
 ) -> None:
     """Work through a whole study; run it again to resume, finished stacks are not repeated."""
-    from cellquant.batch import describe, run_experiment
+    from cellquant.batch import run_experiment
 
     with step("stacks", unit="stacks") as progress:
         outcome = run_experiment(
             experiment, output, workers=workers, scheduler=scheduler, progress=progress
         )
-    for line in describe(outcome):
+    for line in outcome.as_lines("stacks"):
         say(line)
     if outcome.failures:
         raise typer.Exit(2 if outcome.only_input_errors else 1)
