@@ -8,7 +8,7 @@ from typing import Any
 
 from cellquant import __version__
 from cellquant.compare.groups import Group, read_groups
-from cellquant.compare.results import Scalar
+from cellquant.compare.results import Scalar, look_up
 from cellquant.compare.units import STERIC_AREA, packing_fraction_of
 from cellquant.errors import InputError
 from cellquant.storage import write_json
@@ -35,8 +35,9 @@ class Matched:
         Why it must not be compared, or why it is not known; empty where it may be.
     rule
         How it follows from what was measured.
-    interval
-        Time between frames over tau_alpha, for numbers that depend on it; NaN otherwise.
+    interval, smoothing
+        Time between frames over tau_alpha, and points of the moving average, for numbers that
+        depend on them; NaN otherwise.
     """
 
     key: str
@@ -46,6 +47,7 @@ class Matched:
     rule: str
     reason: str = ""
     interval: float = math.nan
+    smoothing: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -214,6 +216,11 @@ def judge(first: Matched, second: Matched) -> Verdict:
             f"it depends on the frame interval, which is {first.interval:.2g} τ_{{α}} on one side "
             f"and {second.interval:.2g} τ_{{α}} on the other"
         )
+    if abs(first.smoothing - second.smoothing) > 0:
+        reason = reason or (
+            f"it depends on the smoothing, {first.smoothing:g} points on one side and "
+            f"{second.smoothing:g} on the other"
+        )
     if not reason and not math.isfinite(difference):
         reason = "one side is not known"
     if not reason and not (math.isfinite(error) and error > 0):
@@ -284,7 +291,11 @@ def _packing(group: Group, scalars: Mapping[str, Scalar], area: tuple[float, flo
     error = density.std_error if math.isfinite(density.std_error) else 0.0
     value, spread = packing_fraction_of(density.value, error, area=area)
     rule = f"density × steric cell area of {area[0]:.0f} ± {area[1]:.0f} µm^{{2}}"
-    return Matched(key, label, value, spread, rule)
+    reason = (
+        "no one-to-one map leads from a density to a packing fraction; the effective value "
+        "orders the two sides"
+    )
+    return Matched(key, label, value, spread, rule, reason)
 
 
 def _ratios(group: Group, scalars: Mapping[str, Scalar]) -> dict[str, Matched]:
@@ -304,7 +315,12 @@ def _ratios(group: Group, scalars: Mapping[str, Scalar]) -> dict[str, Matched]:
         )
     if speed is not None and d is not None:
         product = _product("speed", "Mean speed, in d/τ_{α}", [(speed, 1), (tau, 1), (d, -1)])
-        found["speed"] = replace(product, interval=_frame_interval(group) / tau.value)
+        points = look_up(group.members[0].summary, "processing.smoothing_points")
+        found["speed"] = replace(
+            product,
+            interval=_frame_interval(group) / tau.value,
+            smoothing=math.nan if points is None else float(points),
+        )
     return found
 
 

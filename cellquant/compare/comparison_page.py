@@ -283,7 +283,9 @@ def _units_section(comparison: Comparison, pairs: Pairs) -> Section | None:
         )
         for group in comparison.experiments
         if (density := group.scalars().get("density.mean")) is not None
-        and (phi := matched_scalars(group, area=comparison.area)["packing_fraction"]).reason == ""
+        and math.isfinite(
+            (phi := matched_scalars(group, area=comparison.area)["packing_fraction"]).value
+        )
     ]
     tables = []
     if rows:

@@ -40,7 +40,8 @@ def shape_figure(groups: Sequence[Group]) -> Figure | None:
     every = [curve for _, curves in sides for curve in curves]
     if not every:
         return None
-    top = 1.06 * max(float(np.nanmax(c.y)) for c in every)
+    tops = [c.y if c.error is None else c.y + np.nan_to_num(c.error) for c in every]
+    top = 1.06 * max(float(np.nanmax(y)) for y in tops)
     return _paired(
         sides,
         name="shape-index",
@@ -286,7 +287,8 @@ def _paired(
             legend_rows=rows,
             top=_own_time(own_time, single[0]) if own_time and single else None,
         )
-        label = f"{side}: {single[0]}" if len(single) == 1 else side
+        named = len(single) == 1 and single[0].lower() != side.lower()
+        label = f"{side}: {single[0]}" if named else side
         panels.append(Panel(panel_name, svg, f"{alt}; {side.lower()}.", label))
     every = {f"{side}: {c.label}": c for side, curves in sides for c in curves if c.label}
     return Figure(name, title, caption, tuple(panels), join_curves(every, column), wide=True)

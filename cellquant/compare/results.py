@@ -102,6 +102,8 @@ _CATALOGUE = (
            "exponential fit of the van Hove function at t = τ_{α}", "van_hove.xi_std_error"),
     _Entry("msd.exponent", "Exponent of the MSD", (0, 0), "slope in the logarithms at long lags",
            "msd.exponent_std_error"),
+    _Entry("msd.diffusion_coefficient", "Diffusion coefficient D", (2, -1),
+           "MSD/(4t) at a third of the longest lag", "msd.diffusion_coefficient_std_error"),
     _Entry("alpha2_peak.value", "Peak of α_{2}", (0, 0), "largest non-Gaussian parameter",
            "alpha2_peak.std_error"),
     _Entry("alpha2_peak.lag_time", "Lag of the peak of α_{2}", (0, 1), "lag of that peak"),

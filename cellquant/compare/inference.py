@@ -1,0 +1,376 @@
+"""Parameters of the model that agree with a layer, with credible regions, from a sweep."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cellquant.compare.groups import SCENE_KEYS, Group
+from cellquant.compare.ranking import REDUCED_UNITS, Units, common_features, features_of
+from cellquant.errors import InputError
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Parameters of the model that agree with a target.
+
+    Attributes
+    ----------
+    names
+        Parameters that vary over the sweep.
+    samples
+        (n, len(names)) draws from the posterior.
+    log_density
+        (n,) its logarithm at the draws, up to a constant.
+    features
+        Features used.
+    bounds
+        Range of each parameter in the sweep, the support of the flat prior.
+    """
+
+    names: tuple[str, ...]
+    samples: FloatArray
+    log_density: FloatArray
+    features: tuple[str, ...]
+    bounds: Mapping[str, tuple[float, float]]
+    emulator: "Emulator"
+    target: tuple[FloatArray, FloatArray]
+
+    def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
+        """Low end, median and high end of the central interval of one parameter."""
+        column = self.samples[:, self.names.index(name)]
+        low, middle, high = np.quantile(column, [(1 - level) / 2, 0.5, (1 + level) / 2])
+        return float(low), float(middle), float(high)
+
+    def contains(self, scene: Mapping[str, float], level: float = 0.95) -> bool:
+        """Whether a point lies in the region of highest posterior density of this probability."""
+        point = np.array([[scene[name] for name in self.names]])
+        density = float(self.emulator.log_likelihood(point, *self.target)[0])
+        return density >= float(np.quantile(self.log_density, 1 - level))
+
+    def at_edge(self, name: str) -> bool:
+        """Whether the posterior leans on an end of the sweep's range, and so may go beyond it."""
+        low, high = self.bounds[name]
+        near = 0.05 * (high - low)
+        column = self.samples[:, self.names.index(name)]
+        return bool(max((column < low + near).mean(), (column > high - near).mean()) > 0.2)
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """Gaussian processes that give each feature at any point of the sweep, with its error.
+
+    Attributes
+    ----------
+    names, features
+        Parameters and features.
+    models
+        One process per feature.
+    widen
+        Factor >= 1 on the error of each, from predicting every scene without itself.
+    low, high
+        Range of each parameter in the sweep.
+    correlation
+        Of the features between seeds of a scene.
+    """
+
+    names: tuple[str, ...]
+    features: tuple[str, ...]
+    models: tuple[Any, ...]
+    widen: FloatArray
+    low: FloatArray
+    high: FloatArray
+    correlation: FloatArray
+
+    def predict(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation, (n, features), of the expected feature."""
+        scaled = _scaled(points, self.low, self.high)
+        pairs = [model.predict(scaled, return_std=True) for model in self.models]
+        deviation = np.column_stack([p[1] for p in pairs]) * self.widen
+        return np.column_stack([p[0] for p in pairs]), deviation
+
+    def log_likelihood(
+        self, points: FloatArray, value: FloatArray, error: FloatArray
+    ) -> FloatArray:
+        """Logarithm of the probability of the observed features at each point."""
+        mean, deviation = self.predict(points)
+        covariance = np.repeat((self.correlation * np.outer(error, error))[None], len(points), 0)
+        diagonal = np.arange(len(value))
+        covariance[:, diagonal, diagonal] += deviation**2
+        factor = np.linalg.cholesky(covariance)
+        z = np.linalg.solve(factor, (value - mean)[..., None])[..., 0]
+        volume = np.log(factor[:, diagonal, diagonal]).sum(axis=1)
+        out: FloatArray = -0.5 * (z**2).sum(axis=1) - volume
+        return out
+
+
+def train(candidates: Sequence[Group], features: Sequence[str], *, seed: int = 0) -> Emulator:
+    """Fit a Gaussian process per feature to the scenes of a sweep, each with its own error.
+
+    Parameters
+    ----------
+    candidates
+        Simulated scenes; those without known phi, v0 and eta, or without a feature, are left out.
+    features
+        Names of the features.
+    seed
+        Seed of the optimiser's restarts.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than eight scenes, or no parameter varies.
+    """
+    tables = [features_of(group, REDUCED_UNITS) for group in candidates]
+    known = [
+        (group, table)
+        for group, table in zip(candidates, tables, strict=True)
+        if len(group.scene) == len(SCENE_KEYS) and all(f in table for f in features)
+    ]
+    if len(known) < 8:
+        raise InputError(
+            f"{len(known)} scenes with known phi, v0 and eta are given and an estimate needs "
+            "eight or more; add the folder of a sweep."
+        )
+    names = tuple(k for k in SCENE_KEYS if len({g.scene[k] for g, _ in known}) > 1)
+    if not names:
+        raise InputError("no parameter varies over the sweep; vary phi, v0 or eta.")
+    points = np.array([[group.scene[name] for name in names] for group, _ in known])
+    low, high = points.min(axis=0), points.max(axis=0)
+    values = np.array([[table[f].value for f in features] for _, table in known])
+    errors = np.array([[table[f].std_error for f in features] for _, table in known])
+    scaled = _scaled(points, low, high)
+    models = tuple(
+        _gaussian_process(scaled, values[:, i], errors[:, i], seed) for i in range(len(features))
+    )
+    widen = np.array([_left_out_spread(model) for model in models])
+    correlation = _correlation([group for group, _ in known], features)
+    return Emulator(names, tuple(features), models, widen, low, high, correlation)
+
+
+def fit_parameters(
+    target: Group,
+    candidates: Sequence[Group],
+    *,
+    units: Units | None = None,
+    emulator: Emulator | None = None,
+    n_points: int = 1024,
+    seed: int = 0,
+) -> Posterior:
+    """Estimate phi, v0 and eta of a target, with credible regions, from a sweep.
+
+    A Gaussian process per feature (anisotropic squared exponential plus a linear trend,
+    scikit-learn) is fitted to the scenes; the likelihood of the target's features is Gaussian
+    with the errors of target and emulator, and correlations between features as found between
+    seeds of a scene. The prior is flat over the range of the sweep: nothing is said beyond it.
+
+    Parameters
+    ----------
+    target
+        The layer to match.
+    candidates
+        Simulated scenes of a sweep in which at least one parameter varies.
+    units
+        L0 and t0 in the target's units; pure numbers only when None.
+    emulator
+        An emulator of the same scenes (`train`); fitted here when None.
+    n_points
+        Number of draws; they start from a scrambled Sobol sequence over the prior.
+    seed
+        Seed of everything random; equal seeds give equal posteriors.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than eight scenes, no parameter varies, or no feature is shared.
+
+    References
+    ----------
+    Rasmussen & Williams, Gaussian Processes for Machine Learning (2006), chapter 2.
+    Kennedy & O'Hagan, J. R. Stat. Soc. B 63, 425 (2001), doi:10.1111/1467-9868.00294.
+    """
+    from scipy.stats import qmc
+
+    if emulator is None:
+        emulator = train(candidates, common_features(target, candidates, units)[0], seed=seed)
+    ours = features_of(target, units)
+    absent = [name for name in emulator.features if name not in ours]
+    if absent:
+        raise InputError(
+            f"{target.name} lacks {', '.join(absent)} or its error; observe it in full, or train "
+            "the emulator without."
+        )
+    value = np.array([ours[f].value for f in emulator.features])
+    error = np.array([ours[f].std_error for f in emulator.features])
+    low, high = emulator.low, emulator.high
+    start = low + qmc.Sobol(len(low), seed=seed).random(n_points) * (high - low)
+    samples, density = _sample(
+        lambda points: emulator.log_likelihood(points, value, error),
+        start,
+        low,
+        high,
+        np.random.default_rng(seed),
+    )
+    bounds = {n: (float(a), float(b)) for n, a, b in zip(emulator.names, low, high, strict=True)}
+    return Posterior(
+        emulator.names,
+        samples,
+        density,
+        emulator.features,
+        bounds,
+        emulator,
+        (value, error),
+    )
+
+
+def _sample(
+    log_density: Callable[[FloatArray], FloatArray],
+    points: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Carry points from the flat prior to the posterior, by tempering and Metropolis moves.
+
+    The power of the density rises from 0 to 1 in steps that keep half of the points effective;
+    after each step the points are drawn again by weight and moved eight times, with steps shaped
+    like their covariance (Del Moral, Doucet & Jasra, J. R. Stat. Soc. B 68, 411 (2006)).
+    """
+    n, d = points.shape
+    density = log_density(points)
+    power = 0.0
+    while power < 1.0:
+        step = _next_step(density, 1.0 - power, n / 2)
+        power = 1.0 if step >= 1.0 - power else power + step
+        weight = np.exp(step * (density - density.max()))
+        chosen = rng.choice(n, n, p=weight / weight.sum())
+        points, density = points[chosen], density[chosen]
+        covariance = np.atleast_2d(np.cov(points, rowvar=False))
+        floor = np.diag((1e-5 * (high - low)) ** 2)
+        shape = np.linalg.cholesky(covariance * 2.4**2 / d + floor)
+        for _ in range(8):
+            proposed = points + rng.standard_normal((n, d)) @ shape.T
+            inside = ((proposed >= low) & (proposed <= high)).all(axis=1)
+            new = np.full(n, -np.inf)
+            if inside.any():
+                new[inside] = log_density(proposed[inside])
+            accept = np.log(rng.random(n)) < power * (new - density)
+            points = np.where(accept[:, None], proposed, points)
+            density = np.where(accept, new, density)
+    return points, density
+
+
+def _next_step(density: FloatArray, largest: float, effective: float) -> float:
+    """Largest rise of the power that leaves that many effective points."""
+
+    def count(step: float) -> float:
+        weight = np.exp(step * (density - density.max()))
+        return float(weight.sum() ** 2 / (weight**2).sum())
+
+    if count(largest) >= effective:
+        return largest
+    low, high = 0.0, largest
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if count(middle) >= effective else (low, middle)
+    return max(low, 1e-9)
+
+
+def _gaussian_process(x: FloatArray, y: FloatArray, error: FloatArray, seed: int) -> Any:
+    import warnings
+
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
+
+    spread = float(y.std()) or 1.0
+    kernel = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(
+        np.full(x.shape[1], 1.0), (0.15, 20.0)
+    ) + ConstantKernel(1.0, (1e-3, 1e3)) * DotProduct(1.0, (1e-2, 1e2))
+    model = GaussianProcessRegressor(
+        kernel,
+        alpha=(error / spread) ** 2 + 1e-6,
+        normalize_y=True,
+        n_restarts_optimizer=2,
+        random_state=seed,
+    )
+    with warnings.catch_warnings():
+        # A length scale at its bound means that the feature does not depend on that parameter.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return model.fit(x, y)
+
+
+def _scaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Parameters on [0, 1]; by their logarithm where the sweep spans more than a factor three."""
+    wide = (low > 0) & (high > 3 * low)
+    safe = [np.where(wide, v, 1.0) for v in (points, low, high)]
+    straight = (points - low) / (high - low)
+    curved = np.log(safe[0] / safe[1]) / np.where(wide, np.log(safe[2] / safe[1]), 1.0)
+    out: FloatArray = np.where(wide, curved, straight)
+    return out
+
+
+def _left_out_spread(model: Any) -> float:
+    """Root mean square of the leave-one-out residuals over their predicted errors, at least 1.
+
+    With K the covariance of the data, the residual of point i predicted from the others is
+    ``[K^-1 y]_i / [K^-1]_ii`` and its variance ``1 / [K^-1]_ii`` (Rasmussen & Williams, 5.4.2).
+    """
+    covariance = model.kernel_(model.X_train_) + np.diag(model.alpha)
+    inverse = np.linalg.inv(covariance)
+    diagonal = np.diag(inverse)
+    residual = inverse @ model.y_train_
+    return max(1.0, float(np.sqrt(np.mean(residual**2 / diagonal))))
+
+
+def _correlation(scenes: Sequence[Group], features: Sequence[str]) -> FloatArray:
+    """Correlation of the features between seeds of a scene, shrunk towards independence."""
+    from sklearn.covariance import ledoit_wolf
+
+    rows = []
+    for group in scenes:
+        if group.n < 2:
+            continue
+        parts = [
+            features_of(Group(group.name, True, {"1": results}, group.scene), REDUCED_UNITS)
+            for results in group.trials.values()
+        ]
+        if all(f in part for part in parts for f in features):
+            block = np.array([[part[f].value for f in features] for part in parts])
+            rows.append((block - block.mean(axis=0)) * math.sqrt(len(parts) / (len(parts) - 1)))
+    if len(rows) < 2:
+        return np.eye(len(features))
+    residuals = np.vstack(rows)
+    scale = residuals.std(axis=0)
+    if not (scale > 0).all():
+        return np.eye(len(features))
+    covariance, _ = ledoit_wolf(residuals / scale)
+    deviation = np.sqrt(np.diag(covariance))
+    correlation: FloatArray = covariance / np.outer(deviation, deviation)
+    return correlation
+
+
+def sensitivity(posterior: Posterior) -> dict[str, dict[str, float]]:
+    """Which feature constrains which parameter.
+
+    Change of the emulated feature from one end of a parameter's range to the other, the others
+    at their posterior medians, in standard errors of the target.
+
+    Returns
+    -------
+    dict
+        By feature, then by parameter.
+    """
+    middle = np.array([posterior.interval(name)[1] for name in posterior.names])
+    out: dict[str, dict[str, float]] = {feature: {} for feature in posterior.features}
+    for i, name in enumerate(posterior.names):
+        ends = np.array([middle, middle])
+        ends[:, i] = posterior.bounds[name]
+        mean, _ = posterior.emulator.predict(ends)
+        for j, feature in enumerate(posterior.features):
+            out[feature][name] = float((mean[1, j] - mean[0, j]) / posterior.target[1][j])
+    return out

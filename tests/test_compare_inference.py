@@ -1,0 +1,217 @@
+"""Ranking and estimation of parameters: known answers come back, doubt is admitted."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cellquant.compare.groups import Group, read_groups
+from cellquant.compare.inference import fit_parameters, sensitivity, train
+from cellquant.compare.ranking import REDUCED_UNITS, Units, features_of, rank_candidates
+from cellquant.compare.results import Result
+from cellquant.errors import InputError
+
+
+def toy(
+    phi: float, v0: float, eta: float, *, seed: int, noise: float = 1.0, scale: float = 1.0
+) -> Result:
+    """Observables as smooth functions of the parameters, with errors that are what they say.
+
+    `scale` multiplies lengths by 20 and times by 1/6 when it is not 1, as a movie would.
+    """
+    rng = np.random.default_rng(seed)
+    length, time = (1.0, 1.0) if scale == 1.0 else (20.0, 1 / 6)
+
+    def draw(value: float, error: float) -> tuple[float, float]:
+        return value + noise * error * rng.standard_normal(), error
+
+    mean, mean_error = draw(3.72 + 2.2 * v0 - 1.8 * eta + 0.4 * (phi - 0.9), 0.004)
+    std, std_error = draw(0.05 + 1.1 * v0 - 0.6 * eta, 0.003)
+    skew, skew_error = draw(1.0 + 6 * v0, 0.1)
+    tau = 8 / v0 * (1 + 20 * (phi - 0.9) ** 2 + 5 * eta)
+    tau, tau_error = draw(tau, 0.06 * tau)
+    speed, speed_error = draw(v0 * (1.2 - phi), 0.002 * v0)
+    p = np.linspace(3.5, 4.6, 200)
+    density = np.exp(-0.5 * ((p - mean) / std) ** 2)
+    density /= density.sum() * (p[1] - p[0])
+    summary = {
+        "length_unit": "L0" if scale == 1.0 else "um",
+        "time_unit": "t0" if scale == 1.0 else "min",
+        "n_frames": 10,
+        "n_tracks": 100,
+        "shape_index": {"mean": mean, "std_error": mean_error, "std": std,
+                        "std_std_error": std_error, "skewness": skew,
+                        "skewness_std_error": skew_error, "n": 1000},
+        "tau_alpha": {"value": tau * time, "std_error": tau_error * time},
+        "speed": {"mean": speed * length / time, "std_error": speed_error * length / time,
+                  "dt": 1.0 * time},
+        "processing": {"smoothing_points": 1},
+    }  # fmt: skip
+    table = pd.DataFrame({"shape_index": p, "value": density, "std_error": 0.02 * density})
+    scene = {"phi": phi, "v0": v0, "eta": eta} if scale == 1.0 else {}
+    record = {"settings": {"scene": scene, "seed": seed}}
+    name = f"phi {phi:g}, v0 {v0:g}, eta {eta:g}"
+    return Result(name, summary, {"shape_index": table}, record)
+
+
+def grid(seeds: int = 1) -> list[Group]:
+    groups = []
+    for i, phi in enumerate((0.88, 0.92, 0.96, 1.0)):
+        for j, v0 in enumerate((0.01, 0.03, 0.05, 0.07)):
+            for k, eta in enumerate((0.01, 0.03, 0.05)):
+                base = 1000 * i + 100 * j + 10 * k
+                trials = {str(s): (toy(phi, v0, eta, seed=base + s),) for s in range(seeds)}
+                scene = {"phi": phi, "v0": v0, "eta": eta}
+                groups.append(Group(f"{phi}-{v0}-{eta}", True, trials, scene))
+    return groups
+
+
+@pytest.fixture(scope="module")
+def sweep() -> list[Group]:
+    return grid()
+
+
+def target(phi: float, v0: float, eta: float, seed: int) -> Group:
+    (group,) = read_groups([toy(phi, v0, eta, seed=seed)])
+    return group
+
+
+def test_the_true_scene_ranks_first(sweep: list[Group]) -> None:
+    found = rank_candidates(target(0.96, 0.05, 0.03, 7), sweep, units=REDUCED_UNITS)
+    first = found.ranks[0]
+    assert first.scene == {"phi": 0.96, "v0": 0.05, "eta": 0.03}
+    assert first.distance < 2
+    assert first.distance < found.ranks[1].distance
+    assert "P(p)" in found.features
+    assert sum(rank.best_probability for rank in found.ranks) == pytest.approx(1.0)
+
+
+def test_equal_candidates_are_not_distinguishable(sweep: list[Group]) -> None:
+    twins = [
+        Group(name, True, {"1": (toy(0.96, 0.05, 0.03, seed=seed),)}, {})
+        for name, seed in (("one", 11), ("two", 12))
+    ]
+    found = rank_candidates(target(0.96, 0.05, 0.03, 7), [*twins, sweep[0]], units=REDUCED_UNITS)
+    assert {rank.name for rank in found.not_distinguishable} == {"one", "two"}
+    assert "not distinguishable from" in found.statement()
+    assert found.ranks[-1].best_probability == 0.0
+    assert found.ranks[-1].interval == (3, 3)
+
+
+def test_ranking_depends_on_the_seed_alone(sweep: list[Group]) -> None:
+    wanted = target(0.92, 0.03, 0.01, 3)
+    assert rank_candidates(wanted, sweep) == rank_candidates(wanted, sweep)
+    other = rank_candidates(wanted, sweep, seed=1)
+    assert [r.name for r in other.ranks] == [r.name for r in rank_candidates(wanted, sweep).ranks]
+
+
+def test_units_bring_times_and_lengths_into_play() -> None:
+    movie = Group("movie", False, {"1": (toy(0.92, 0.03, 0.01, seed=5, scale=2.0),)}, {})
+    model = target(0.92, 0.03, 0.01, 5)
+    pure = features_of(movie, None)
+    assert "tau_alpha.value" not in pure
+    units = Units((20.0, 0.0), (1 / 6, 0.0))
+    ours, theirs = features_of(movie, units), features_of(model, REDUCED_UNITS)
+    for name in theirs:
+        assert ours[name].value == pytest.approx(theirs[name].value)
+        assert ours[name].std_error == pytest.approx(theirs[name].std_error)
+    doubtful = features_of(movie, Units((20.0, 2.0), (1 / 6, 1 / 60)))
+    assert doubtful["speed.mean"].std_error > math.hypot(0.1, 0.1)
+
+
+def test_speed_of_another_frame_interval_is_left_out(sweep: list[Group]) -> None:
+    wanted = toy(0.92, 0.03, 0.01, seed=3)
+    wanted.summary["speed"]["dt"] = 5.0
+    found = rank_candidates(read_groups([wanted])[0], sweep, units=REDUCED_UNITS)
+    assert "speed.mean" in found.left_out
+
+
+def test_known_parameters_come_back(sweep: list[Group]) -> None:
+    rng = np.random.default_rng(2)
+    features = ("shape_index.mean", "shape_index.std", "shape_index.skewness", "tau_alpha.value",
+                "speed.mean")  # fmt: skip
+    emulator = train(sweep, features)
+    inside = 0
+    widths = []
+    for case in range(20):
+        truth = {
+            "phi": rng.uniform(0.89, 0.99),
+            "v0": rng.uniform(0.015, 0.065),
+            "eta": rng.uniform(0.012, 0.048),
+        }
+        found = fit_parameters(
+            target(**truth, seed=9000 + case),
+            sweep,
+            units=REDUCED_UNITS,
+            emulator=emulator,
+            n_points=1024,
+        )
+        inside += found.contains(truth)
+        low, _, high = found.interval("v0")
+        widths.append(high - low)
+    assert inside >= 18
+    # The region is worth something: a small part of the range of the sweep.
+    assert np.median(widths) < 0.2 * 0.06
+
+
+def test_region_does_not_hold_a_wrong_answer(sweep: list[Group]) -> None:
+    found = fit_parameters(target(0.92, 0.05, 0.02, 4), sweep, units=REDUCED_UNITS, n_points=1024)
+    assert not found.contains({"phi": 0.92, "v0": 0.02, "eta": 0.02})
+    assert not found.at_edge("v0")
+    effect = sensitivity(found)
+    assert abs(effect["speed.mean"]["v0"]) > abs(effect["speed.mean"]["eta"])
+
+
+def test_correlated_seeds_are_seen() -> None:
+    emulator = train(grid(seeds=3), ("shape_index.mean", "shape_index.std"))
+    assert emulator.correlation.shape == (2, 2)
+    assert abs(emulator.correlation[0, 1]) < 0.5
+
+
+def test_what_is_refused(sweep: list[Group]) -> None:
+    wanted = target(0.92, 0.03, 0.01, 3)
+    with pytest.raises(InputError, match="ranking needs two or more"):
+        rank_candidates(wanted, sweep[:1])
+    with pytest.raises(InputError, match="needs eight or more"):
+        fit_parameters(wanted, sweep[:5])
+    with pytest.raises(InputError, match="no parameter varies"):
+        fit_parameters(wanted, sweep[:1] * 9)
+    bare = Group("bare", False, {"1": (Result("bare", {"length_unit": "um", "time_unit": "min"},
+                                              {}, {}),)}, {})  # fmt: skip
+    with pytest.raises(InputError, match="no feature with a standard error in common"):
+        rank_candidates(bare, sweep)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_parameters_of_simulated_layers_come_back() -> None:
+    """Reduced problem: 36 cells for 100 t0; 64 scenes to learn from, 20 to recover."""
+    from scipy.stats import qmc
+
+    import cellquant as cq
+
+    low, high = np.array([0.88, 0.02, 0.01]), np.array([1.0, 0.08, 0.06])
+
+    def layer(point: np.ndarray, seed: int) -> Group:
+        phi, v0, eta = (float(v) for v in point)
+        scene = cq.Scene(phi=phi, v0=v0, eta=eta, n_cells=36, seed=seed)
+        run = cq.simulate(scene, duration=100.0, transient=40.0, dt=0.04, save_every=2.0)
+        found = cq.observe(run, only=["shape_index", "speed", "msd"])
+        known = {"phi": phi, "v0": v0, "eta": eta}
+        result = Result(f"seed {seed}", found.summary, found.tables, {"settings": known})
+        return Group(f"seed {seed}", True, {"1": (result,)}, known)
+
+    points = low + qmc.Sobol(3, seed=0).random(64) * (high - low)
+    sweep = [layer(point, seed) for seed, point in enumerate(points)]
+    features = ("shape_index.mean", "shape_index.std", "speed.mean", "msd.diffusion_coefficient",
+                "msd.exponent")  # fmt: skip
+    emulator = train(sweep, features)
+    rng = np.random.default_rng(5)
+    inside = 0
+    for case in range(20):
+        truth = low + (0.08 + 0.84 * rng.random(3)) * (high - low)
+        wanted = layer(truth, 5000 + case)
+        found = fit_parameters(wanted, sweep, units=REDUCED_UNITS, emulator=emulator)
+        inside += found.contains(wanted.scene)
+    assert inside >= 18
