@@ -38,7 +38,7 @@ class Tally:
 
 
 def walkers(tally: Tally, seed: int) -> None:
-    diffusion, dt, q, n_frames = 0.02, 0.5, 2 * np.pi, 160
+    diffusion, dt, q, n_frames = 0.02, 0.5, 2 * np.pi, 400
     tracks = brownian(
         np.random.default_rng(seed), 100, n_frames, diffusion=diffusion, frame_interval=dt
     )

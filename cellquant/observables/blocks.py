@@ -104,11 +104,12 @@ def jackknife_error(replicates: FloatArray, informative: FloatArray | None = Non
     if informative is not None:
         used &= informative > 0
     n = used.sum(axis=0)
-    defined = np.where(used, replicates, 0.0)
-    mean = defined.sum(axis=0) / np.maximum(n, 1)
-    squares = np.where(used, (replicates - mean) ** 2, 0.0).sum(axis=0)
+    defined = ~used | np.isfinite(replicates)
+    values = np.where(used & defined, replicates, 0.0)
+    mean = values.sum(axis=0) / np.maximum(n, 1)
+    squares = np.where(used & defined, (values - mean) ** 2, 0.0).sum(axis=0)
     error = np.sqrt((n - 1) / np.maximum(n, 1) * squares)
-    return np.where(n >= 2, error, np.nan)
+    return np.where((n >= 2) & defined.all(axis=0), error, np.nan)
 
 
 def ratio_with_error(sums: FloatArray, counts: FloatArray) -> tuple[FloatArray, FloatArray]:

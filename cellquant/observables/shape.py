@@ -110,6 +110,8 @@ def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distri
     else:
         errors = dict.fromkeys(_DESCRIPTORS, None)
         summary["reason"] = "the error needs at least two replicate blocks"
+    if not np.isfinite(whole["skewness"]):
+        summary["skewness_reason"] = "the values do not vary"
     summary["std_error"] = errors["mean"]
     summary.update({f"{k}_std_error": v for k, v in errors.items() if k != "mean"})
     quantiles = (0.05, 0.25, 0.5, 0.75, 0.95)

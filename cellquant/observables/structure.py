@@ -145,7 +145,9 @@ def structure_factor(
     scale = 2 * np.pi / diameter if diameter else 2 * np.pi * np.sqrt(density)
     limit = 4 * scale if max_wave_number is None else max_wave_number
     step = 2 * np.pi / layer.edges
-    n_x, n_y = np.maximum(np.ceil(limit / step).astype(int), 1)
+    # A field very large for its cells is measured up to the q that half a million vectors reach.
+    limit = min(limit, float(np.sqrt(5e5 * np.prod(step))))
+    n_x, n_y = np.maximum(np.ceil(np.minimum(limit / step, 1e6)).astype(int), 1)
     q_x, q_y = np.arange(n_x + 1) * step[0], np.arange(-n_y, n_y + 1) * step[1]
     power = np.zeros((q_x.size, q_y.size))
     for place in frames:

@@ -102,7 +102,7 @@ class _Reml:
         free = self.n - 2
         volume = float(np.linalg.det(information))
         if not volume > 0:  # random effects so large that nothing is left in double precision
-            return float("inf")
+            return 1e12
         return float(
             log_det
             + np.log(volume)
