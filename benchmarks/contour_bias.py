@@ -208,7 +208,7 @@ def page(result: dict[str, dict[str, dict[str, list[float]]]]) -> str:
         "A corner inside a free contour is rounded by about a sixth of a pixel: cells with sharp",
         "corners that do not touch another cell come out low. So do the cells of a tissue that is",
         "cut by background lines, since their corners are free. Smooth free contours come out",
-        "slightly high. Below 8 px everything grows; see the last table.",
+        "slightly high. In a tissue of smaller cells the scatter grows, not the bias (last table).",
         "",
         *table(result, [*SHAPES, "square", "Voronoi, 1 px lines"]),
         "",
