@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cellquant.track.kernels import neighbour_mean, pair_gains
-from cellquant.track.movie import NEAR, BoolArray, FloatArray, IntArray, Movie
+from cellquant.track.movie import LOG_AREA, NEAR, BoolArray, FloatArray, IntArray, Movie
 
 KINDS = 4  # no path, path after, path before, path on both sides
 TERMS = 7
@@ -17,6 +17,8 @@ _PRIOR_SCALE = 0.15  # of the spacing
 _PRIOR_EVENTS = 2.0
 _PRIOR_RATE = 0.01
 _UNBORN = 0.2
+_PRIOR_SIZES = 20.0
+_SIZE_FLOOR = 0.05
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,20 @@ def regressors(paths: Paths, source: IntArray, target: IntArray) -> FloatArray:
         ),
         axis=1,
     )
+
+
+def expected_steps(movie: Movie, paths: Paths, motion: Motion, *, own_path: bool) -> FloatArray:
+    """Displacement (N, 2) to the next frame expected of each cell, its partner not yet known."""
+    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
+    elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
+    kind = 2 * paths.has_before if own_path else np.zeros(movie.n_cells, dtype=np.int64)
+    weight = motion.coefficients[kind]
+    # What the partner's neighbourhood does now is what the own neighbourhood does now.
+    step = (weight[:, 0] + weight[:, 3])[:, None] * paths.around_after[:, 0]
+    step = step + weight[:, 1, None] * paths.around_after[:, 1]
+    step += weight[:, 2, None] * paths.around_before[:, 0] + weight[:, 5, None] * paths.own_before
+    expected: FloatArray = (paths.drift[frames] + step) * elapsed[:, None]
+    return expected
 
 
 def first_motion(spacing: float) -> Motion:
@@ -306,25 +322,83 @@ def suppose_divisions(rates: Rates) -> Rates:
     return Rates(rates.vanish, (_UNBORN * born, rates.appear[1]), born)
 
 
+@dataclass(frozen=True)
+class Fates:
+    """Log chance of every cell (N,) to stay, vanish and divide before the next frame, and to have
+    appeared since the last, per area."""
+
+    stay: FloatArray
+    vanish: FloatArray
+    divide: FloatArray
+    appear: FloatArray
+
+
+def fates(
+    movie: Movie, links: Links | None, rates: Rates, leaving: BoolArray, entering: BoolArray
+) -> Fates:
+    """Chances of each cell from the rates, and from the size of vanishing and dividing cells.
+
+    The logarithm of the area is normal among the cells of each fate, with a prior that makes them
+    look like any cell.
+    """
+    vanish = np.where(leaving, rates.vanish[1], rates.vanish[0])
+    appear = np.where(entering, rates.appear[1], rates.appear[0])
+    divide = np.full(movie.n_cells, rates.divide)
+    stay = np.maximum(1.0 - vanish - divide, 0.1)
+    if links is not None:
+        size = movie.shape[:, LOG_AREA]
+        cell, last, first = np.arange(movie.n_cells), movie.start[-2], movie.start[1]
+        gone = (cell < last) & (links.after < 0)
+        split = (cell < last) & (links.second >= 0)
+        new = (cell >= first) & (links.before < 0)
+        usual = _size_law(size[(cell < last) & ~gone & ~split], None)
+        vanish = vanish * _size_ratio(size, size[gone], usual)
+        divide = divide * _size_ratio(size, size[split], usual)
+        total = stay + vanish + divide
+        stay, vanish, divide = stay / total, vanish / total, divide / total
+        appear = np.minimum(appear * _size_ratio(size, size[new], usual), 0.5)
+    return Fates(
+        np.log(np.maximum(stay, 1e-6)),
+        np.log(np.maximum(vanish, 1e-9)),
+        np.log(np.maximum(divide, 1e-12)),
+        np.log(appear * movie.density),
+    )
+
+
+def _size_law(values: FloatArray, prior: tuple[float, float] | None) -> tuple[float, float]:
+    """Mean and width of sizes, drawn towards the prior; robust where there is none."""
+    if prior is None:
+        mean = float(np.median(values)) if len(values) else 0.0
+        width = 1.4826 * float(np.median(np.abs(values - mean))) if len(values) else 1.0
+        return mean, max(width, _SIZE_FLOOR)
+    n = len(values) + _PRIOR_SIZES
+    mean = (float(values.sum()) + _PRIOR_SIZES * prior[0]) / n
+    square = float(np.sum((values - mean) ** 2))
+    square += _PRIOR_SIZES * (prior[1] ** 2 + (prior[0] - mean) ** 2)
+    return mean, max(float(np.sqrt(square / n)), _SIZE_FLOOR)
+
+
+def _size_ratio(size: FloatArray, among: FloatArray, usual: tuple[float, float]) -> FloatArray:
+    """How much likelier each size (N,) is among some cells than usual, within a factor of 20."""
+    mean, width = _size_law(among, usual)
+    near, far = (size - mean) / width, (size - usual[0]) / usual[1]
+    odds = 3.0 * (np.log1p(far**2 / 5.0) - np.log1p(near**2 / 5.0)) + np.log(usual[1] / width)
+    ratio: FloatArray = np.exp(np.clip(odds, -3.0, 3.0))
+    return ratio
+
+
 def gains(
     movie: Movie,
     candidates: IntArray,
     paths: Paths,
     motion: Motion,
     shapes: Shapes,
-    rates: Rates,
-    leaving: BoolArray,
-    entering: BoolArray,
+    fates: Fates,
     max_distance: float,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Log odds (N, K) of the candidate links; log of vanishing (N,) and of appearing (N,)."""
+) -> FloatArray:
+    """Log odds (N, K) of the candidate links."""
     frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
     elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
-    vanish = np.where(leaving, rates.vanish[1], rates.vanish[0])
-    appear = np.where(entering, rates.appear[1], rates.appear[0])
-    stay = np.log(np.maximum(1.0 - vanish - rates.divide, 0.1))
-    leave = np.log(vanish)
-    arrive = np.log(appear * movie.density)
     gain = np.empty(candidates.shape)
     around = np.stack(
         (paths.around_after[:, 0], paths.around_after[:, 1], paths.around_before[:, 0]), axis=1
@@ -351,10 +425,10 @@ def gains(
         shapes.population_precision,
         shapes.constant,
         _SHAPE_TAIL,
-        stay,
-        leave,
-        arrive,
+        fates.stay,
+        fates.vanish,
+        fates.appear,
         max_distance,
         gain,
     )
-    return gain, leave, arrive
+    return gain

@@ -13,6 +13,7 @@ _AMBIGUOUS = 0.95
 def describe(movie: Movie, solution: Solution, unit: str, *, n_gaps: int) -> dict[str, Any]:
     """Report of a linked movie, ready for JSON."""
     links, motion = solution.links, solution.motion
+    assert links is not None
     linked = np.flatnonzero(links.before >= 0)
     frames = np.searchsorted(movie.start, np.arange(movie.n_cells), side="right") - 1
     step = np.hypot(*(movie.position[linked] - movie.position[links.before[linked]]).T)
@@ -58,10 +59,12 @@ def describe(movie: Movie, solution: Solution, unit: str, *, n_gaps: int) -> dic
 
 
 def _kinds(solution: Solution) -> np.ndarray[Any, np.dtype[np.int64]]:
-    source = np.flatnonzero(solution.links.after >= 0)
-    target = solution.links.after[source]
+    links = solution.links
+    assert links is not None
+    source = np.flatnonzero(links.after >= 0)
+    target = links.after[source]
     kinds: np.ndarray[Any, np.dtype[np.int64]] = (
-        2 * solution.paths.has_before[source] + solution.paths.has_after[target]
+        2 * solution.known.has_before[source] + solution.known.has_after[target]
     )
     return kinds
 

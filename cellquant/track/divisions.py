@@ -4,12 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cellquant.track.costs import Links, Motion, Paths
+from cellquant.track.costs import Links
 from cellquant.track.kernels import division_gains
 from cellquant.track.movie import LOG_AREA, FloatArray, IntArray, Movie
 
 _PRIOR_DIVISIONS = 10.0
 _PER_MOTHER = 3
+_STRETCH_FLOOR = 0.1
+_LEAST = 6.0
 
 
 @dataclass(frozen=True)
@@ -18,14 +20,18 @@ class Divisions:
 
     ``separation`` of the logarithm of the daughters' distance; ``total`` of the logarithm of
     their summed area over the mother's; ``uneven`` deviation of the logarithm of their ratio;
-    ``mother`` of the logarithm of the mother's area; ``population`` of all cells' areas;
+    ``informative``
+    chance that these sizes say more than those of any two cells; ``stretch`` (3, 3) elongation of
+    mother, daughters and any cell along the daughters' line, its width, and the width across;
+    ``population`` of all cells' areas;
     ``width`` of the place of their middle.
     """
 
     separation: tuple[float, float]
     total: tuple[float, float]
     uneven: float
-    mother: tuple[float, float]
+    informative: float
+    stretch: FloatArray
     population: tuple[float, float]
     width: float
 
@@ -47,11 +53,22 @@ def fit_divisions(movie: Movie, links: Links | None, middle: FloatArray, width: 
     total = np.logaddexp(area[one], area[two]) - area[mothers]
     ratio = area[one] - area[two]
     place = (movie.position[one] + movie.position[two]) / 2 - middle[mothers]
+    total_fit = _normal(total, 0.3, 0.35, 0.1)
+    uneven = _normal(ratio, 0.0, 0.3, 0.1, fixed=True)[1]
+    # How often the sizes of daughters are told better by these laws than by the population.
+    family = _log_normal(total, *total_fit) + _log_normal(ratio, 0.0, uneven)
+    family -= _log_normal(area[one], *population) + _log_normal(area[two], *population)
+    ratio_of = np.exp(np.clip(family, -50.0, 50.0))
+    informative = 0.5
+    for _ in range(20):
+        share = informative * ratio_of / (informative * ratio_of + 1.0 - informative)
+        informative = (float(share.sum()) + 1.0) / (len(mothers) + 2.0)
     return Divisions(
         separation=_normal(apart, np.log(0.85 * spacing), 0.35, 0.1),
-        total=_normal(total, 0.3, 0.35, 0.1),
-        uneven=_normal(ratio, 0.0, 0.3, 0.1, fixed=True)[1],
-        mother=_normal(area[mothers], centre, spread, 0.1),
+        total=total_fit,
+        uneven=uneven,
+        informative=informative,
+        stretch=_fit_stretch(movie, mothers, one, two),
         population=population,
         width=float(
             np.sqrt(
@@ -60,6 +77,22 @@ def fit_divisions(movie: Movie, links: Links | None, middle: FloatArray, width: 
             )
         ),
     )
+
+
+def _fit_stretch(movie: Movie, mothers: IntArray, one: IntArray, two: IntArray) -> FloatArray:
+    elongation = movie.shape[:, 1:3]
+    width = max(float(np.sqrt(np.mean(elongation**2))), _STRETCH_FLOOR)
+    line = movie.position[two] - movie.position[one]
+    angle = 2.0 * np.arctan2(line[:, 1], line[:, 0])
+    along = np.column_stack((np.cos(angle), np.sin(angle)))
+    across = np.column_stack((-np.sin(angle), np.cos(angle)))
+    stretch = np.array([[0.0, width, width]] * 3)
+    for role, cells in ((0, (mothers,)), (1, (one, two))):
+        e = np.concatenate([np.sum(along * elongation[c], axis=1) for c in cells])
+        o = np.concatenate([np.sum(across * elongation[c], axis=1) for c in cells])
+        stretch[role, :2] = _normal(e, 0.0, width, _STRETCH_FLOOR)
+        stretch[role, 2] = _normal(o, 0.0, width, _STRETCH_FLOOR, fixed=True)[1]
+    return stretch
 
 
 def _normal(
@@ -74,6 +107,13 @@ def _normal(
     return centre, max(float(np.sqrt(variance)), floor)
 
 
+def _log_normal(values: FloatArray, mean: float, deviation: float) -> FloatArray:
+    density: FloatArray = -0.5 * ((values - mean) / deviation) ** 2 - np.log(
+        deviation * np.sqrt(2.0 * np.pi)
+    )
+    return density
+
+
 def propose(
     movie: Movie,
     index: int,
@@ -82,7 +122,7 @@ def propose(
     middle: FloatArray,
     model: Divisions,
     tail: float,
-    log_rate: float,
+    log_rate: FloatArray,
     leave: FloatArray,
     appear: FloatArray,
 ) -> tuple[IntArray, FloatArray]:
@@ -92,42 +132,38 @@ def propose(
     their log odds.
     """
     first, last = int(movie.start[index]), int(movie.start[index + 1])
-    limit = 12 * (last - first) + 64
+    limit = 20 * (last - first) + 64
+    least = -_LEAST  # an image cue can still speak for it
     cells = np.empty((limit, 3), dtype=np.int64)
     gain = np.empty(limit)
     elapsed = float(movie.time[index + 1] - movie.time[index])
     found = division_gains(
         movie.position,
-        movie.shape[:, LOG_AREA].copy(),
+        movie.shape,
         candidates,
         orphan,
         middle,
         np.full(movie.n_cells, model.width * np.sqrt(elapsed)),
         tail,
         np.array(model.separation),
-        np.array([*model.total, model.uneven]),
+        np.array([*model.total, model.uneven, model.informative]),
         np.array(model.population),
-        np.array(model.mother),
-        np.full(movie.n_cells, log_rate),
+        model.stretch,
+        log_rate,
         leave,
         appear,
         first,
         last,
+        least,
         cells,
         gain,
     )
     cells, gain = cells[:found], gain[:found]
+    cells[:, 1] = candidates[cells[:, 0], cells[:, 1]]
+    cells[:, 2] = candidates[cells[:, 0], cells[:, 2]]
     order = np.lexsort((-gain, cells[:, 0]))
     cells, gain = cells[order], gain[order]
     start = np.flatnonzero(np.r_[True, cells[1:, 0] != cells[:-1, 0]]) if found else order
     rank = np.arange(found) - np.repeat(start, np.diff(np.append(start, found)))
     keep = rank < _PER_MOTHER
     return cells[keep], gain[keep]
-
-
-def predicted_middle(movie: Movie, paths: Paths, motion: Motion) -> FloatArray:
-    """Where the middle of two daughters is expected, (N, 2), from what is known before."""
-    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
-    elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
-    step = paths.drift[frames] + (paths.around_after[:, 0] + paths.around_after[:, 1]) / 2
-    return movie.position + step * elapsed[:, None]

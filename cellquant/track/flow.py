@@ -86,12 +86,19 @@ def pair_flow(movie: Movie, index: int, previous: FloatArray | None) -> FloatArr
     return best
 
 
-def all_flows(movie: Movie) -> FloatArray:
-    """Displacement (N, 2) of the neighbourhood of each cell to the next frame; 0 in the last."""
+def all_flows(movie: Movie, *, local: bool = True) -> FloatArray:
+    """Displacement (N, 2) of the neighbourhood of each cell to the next frame; 0 in the last.
+
+    Without `local`, all cells of a frame share the most frequent displacement.
+    """
     flow = np.zeros((movie.n_cells, 2))
     previous: FloatArray | None = None
     for index in range(len(movie.time) - 1):
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
+        if not local:
+            spacing = min(movie.spacing[index], movie.spacing[index + 1])
+            flow[a] = common_shift(movie.position[a], movie.position[b], spacing)
+            continue
         flow[a] = pair_flow(movie, index, previous)
         if index + 2 < len(movie.time):
             arrived = movie.position[a] + flow[a]

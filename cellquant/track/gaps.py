@@ -9,8 +9,10 @@ from cellquant.track.movie import FloatArray, IntArray, Movie
 from cellquant.track.solve import Solution
 
 _NEAREST = 6
-_PRIOR_MISSED = 0.002
+_PRIOR_MISSED = 0.005
 _ROUNDS = 3
+_DECOYS = 3  # frames beyond the longest gap that show how often strangers fit by chance
+_CAUTION = np.log(10.0)
 
 
 def close_gaps(
@@ -23,8 +25,9 @@ def close_gaps(
     """Join ends to starts that lie up to `max_gap` missing frames apart.
 
     The place is extrapolated with the local flow, its scatter grows as the square root of time,
-    and the chance to miss a cell is learned from how many gaps there are: a movie without gaps
-    convinces itself that there are none.
+    and the chance to miss a cell is learned from how many gaps there are. Ends and starts that lie
+    farther apart in time than `max_gap` join by chance only, and are subtracted: a movie without
+    gaps convinces itself that there are none. A join must be ten times likelier than not.
 
     Returns
     -------
@@ -33,26 +36,35 @@ def close_gaps(
     confidence : numpy.ndarray
         Probability of each join against the two ends being strangers.
     """
-    source, target, odds = _candidates(movie, solution, max_gap, max_distance)
+    if max_gap == 0:
+        none = np.empty(0, dtype=np.int64)
+        return none, none, np.empty(0)
+    source, target, odds, missing = _candidates(movie, solution, max_gap + _DECOYS, max_distance)
+    allowed = missing <= max_gap
     missed = _PRIOR_MISSED
-    chosen = np.empty(0, dtype=np.int64)
-    total = odds + np.log(missed)
     for _ in range(_ROUNDS):
-        total = odds + np.log(missed)
-        chosen = match(source, target, total)
-        missed = (len(chosen) + 1.0) / (movie.n_cells + 1.0 / _PRIOR_MISSED)
+        joined = missing[match(source, target, odds + np.log(missed))]
+        by_chance = float(np.sum(joined > max_gap)) / _DECOYS * max_gap
+        found = max(float(np.sum(joined <= max_gap)) - by_chance, 0.0)
+        missed = (found + 0.5) / (movie.n_cells + 0.5 / _PRIOR_MISSED)
+    total = (odds + np.log(missed))[allowed]
+    source, target = source[allowed], target[allowed]
+    chosen = match(source, target, total - _CAUTION)
     return source[chosen], target[chosen], 1.0 / (1.0 + np.exp(-np.minimum(total[chosen], 50.0)))
 
 
 def _candidates(
     movie: Movie, solution: Solution, max_gap: int, max_distance: float
-) -> tuple[IntArray, IntArray, FloatArray]:
+) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
     links, motion, shapes, flow = (solution.links, solution.motion, solution.shapes, solution.flow)
+    assert links is not None
+    assert solution.fates is not None
     ends_all = np.flatnonzero(links.after < 0)
     starts_all = np.flatnonzero(links.before < 0)
     sources: list[IntArray] = []
     targets: list[IntArray] = []
     values: list[FloatArray] = []
+    spans: list[IntArray] = []
     n_frames = len(movie.time)
     frame_of = np.searchsorted(movie.start, np.arange(movie.n_cells), side="right") - 1
     for index in range(n_frames - 2):
@@ -62,7 +74,7 @@ def _candidates(
         place = movie.position[ends] + flow[ends]
         for later in range(index + 2, n_frames):
             span = float(movie.time[later] - movie.time[index])
-            if span > max_gap + 1:
+            if span > max_gap + 1 or max_gap < 1:
                 break
             # The flow of the missing frame, read where the cell would be.
             bridge = movie.cells_of(later - 1)
@@ -82,15 +94,25 @@ def _candidates(
             nu = motion.tail[0]
             value = -np.log(2 * np.pi * width**2)
             value = value - (nu / 2 + 1) * np.log1p(np.sum(away**2, axis=1) / (nu * width**2))
-            value += shape_odds(movie, shapes, a, b) - solution.leave[a] - solution.appear[b]
+            value += (
+                shape_odds(movie, shapes, a, b)
+                - solution.fates.vanish[a]
+                - solution.fates.appear[b]
+            )
             value[raw > max_distance * span] = -np.inf
             sources.append(a)
             targets.append(b)
             values.append(value)
+            spans.append(np.full(len(a), round(span) - 1, dtype=np.int64))
     if not sources:
         none = np.empty(0, dtype=np.int64)
-        return none, none, np.empty(0)
-    return np.concatenate(sources), np.concatenate(targets), np.concatenate(values)
+        return none, none, np.empty(0), none
+    return (
+        np.concatenate(sources),
+        np.concatenate(targets),
+        np.concatenate(values),
+        np.concatenate(spans),
+    )
 
 
 def shape_odds(movie: Movie, shapes: Shapes, source: IntArray, target: IntArray) -> FloatArray:

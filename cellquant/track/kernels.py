@@ -240,7 +240,7 @@ def pair_gains(
 @njit(cache=True)
 def division_gains(
     position: FloatArray,
-    log_area: FloatArray,
+    shape: FloatArray,
     candidates: IntArray,
     orphan: IntArray,
     middle: FloatArray,
@@ -249,20 +249,23 @@ def division_gains(
     separation: FloatArray,
     ratios: FloatArray,
     population: FloatArray,
-    mother: FloatArray,
+    stretch: FloatArray,
     prior: FloatArray,
     leave: FloatArray,
     appear: FloatArray,
     first: int,
     last: int,
+    least: float,
     out_cells: IntArray,
     out_gain: FloatArray,
 ) -> int:
     """Log odds of divisions with at least one daughter that has no sure mother; their number.
 
     The middle of the daughters stays near the predicted place (Student density), their distance
-    is log-normal, the sum of their areas against the mother's and their ratio are log-normal.
-    Writes (mother, daughter, daughter) into out_cells, as many as fit.
+    is log-normal, and so are the sum of their areas against the mother's and their ratio, unless
+    (with chance 1 - ratios[3]) their sizes tell nothing. Mother and daughters are elongated along
+    their line by `stretch` (mother, daughters, any cell: mean, width along, width across).
+    Writes (mother, column and column of the daughters among its candidates), as many as fit.
     """
     k = candidates.shape[1]
     found = 0
@@ -288,23 +291,111 @@ def division_gains(
                 z = (np.log(apart) - separation[0]) / separation[1]
                 value -= 0.5 * z * z + np.log(separation[1] * np.sqrt(2 * np.pi))
                 value -= np.log(2 * np.pi * apart * apart)
-                both = np.log(np.exp(log_area[j]) + np.exp(log_area[h])) - log_area[i]
+                both = np.log(np.exp(shape[j, 0]) + np.exp(shape[h, 0])) - shape[i, 0]
                 z = (both - ratios[0]) / ratios[1]
-                value -= 0.5 * z * z + np.log(ratios[1] * np.sqrt(2 * np.pi))
-                z = (log_area[j] - log_area[h]) / ratios[2]
-                value -= 0.5 * z * z + np.log(ratios[2] * np.sqrt(2 * np.pi))
+                sizes = -0.5 * z * z - np.log(2 * np.pi * ratios[1] * ratios[2])
+                z = (shape[j, 0] - shape[h, 0]) / ratios[2]
+                sizes -= 0.5 * z * z
                 for g in (j, h):
-                    z = (log_area[g] - population[0]) / population[1]
-                    value += 0.5 * z * z + np.log(population[1] * np.sqrt(2 * np.pi))
-                z = (log_area[i] - population[0]) / population[1]
-                value += 0.5 * z * z + np.log(population[1] * np.sqrt(2 * np.pi))
-                z = (log_area[i] - mother[0]) / mother[1]
-                value -= 0.5 * z * z + np.log(mother[1] * np.sqrt(2 * np.pi))
+                    z = (shape[g, 0] - population[0]) / population[1]
+                    sizes += 0.5 * z * z + np.log(population[1] * np.sqrt(2 * np.pi))
+                value += np.log(1.0 - ratios[3] + ratios[3] * np.exp(sizes))
+                # Elongation along and across the line between the daughters.
+                along = (dx * dx - dy * dy) / (apart * apart)
+                across = 2.0 * dx * dy / (apart * apart)
+                for g, role in ((i, 0), (j, 1), (h, 1)):
+                    e = along * shape[g, 1] + across * shape[g, 2]
+                    o = along * shape[g, 2] - across * shape[g, 1]
+                    z = (e - stretch[role, 0]) / stretch[role, 1]
+                    value += 0.5 * ((e * e + o * o) / stretch[2, 1] ** 2 - z * z)
+                    value -= 0.5 * (o / stretch[role, 2]) ** 2
+                    value += np.log(stretch[2, 1] ** 2 / (stretch[role, 1] * stretch[role, 2]))
                 value += prior[i] - leave[i] - appear[j] - appear[h]
-                if value > 0.0 and found < len(out_gain):
+                if value > least and found < len(out_gain):
                     out_cells[found, 0] = i
-                    out_cells[found, 1] = j
-                    out_cells[found, 2] = h
+                    out_cells[found, 1] = c
+                    out_cells[found, 2] = d
                     out_gain[found] = value
                     found += 1
     return found
+
+
+@njit(cache=True)
+def overlap_shares(
+    here: IntArray,
+    there: IntArray,
+    label: IntArray,
+    centre: FloatArray,
+    half: FloatArray,
+    shift: IntArray,
+    one: IntArray,
+    two: IntArray,
+    stride: int,
+    share: FloatArray,
+) -> None:
+    """Share (L,) of each cell that falls on the labels `one` or `two` after an integer shift.
+
+    Only every `stride`-th row and column of the box ``centre +- half`` is visited.
+    """
+    height, width = here.shape
+    for p in range(len(label)):
+        top = max(int(centre[p, 1] - half[p]), 0)
+        bottom = min(int(centre[p, 1] + half[p]) + 2, height)
+        left = max(int(centre[p, 0] - half[p]), 0)
+        right = min(int(centre[p, 0] + half[p]) + 2, width)
+        size = 0
+        common = 0
+        for y in range(top, bottom, stride):
+            v = y + shift[p, 1]
+            for x in range(left, right, stride):
+                if here[y, x] != label[p]:
+                    continue
+                size += 1
+                u = x + shift[p, 0]
+                if u < 0 or v < 0 or u >= width or v >= height:
+                    continue
+                other = there[v, u]
+                if other == one[p] or other == two[p]:
+                    common += 1
+        share[p] = common / size if size > 0 else np.nan
+
+
+@njit(cache=True)
+def patch_correlations(
+    here: FloatArray,
+    there: FloatArray,
+    source: IntArray,
+    target: IntArray,
+    half: int,
+    stride: int,
+    correlation: FloatArray,
+) -> None:
+    """Normalised cross-correlation (L,) of square patches around pixels (L, 2) of two images.
+
+    NaN where less than half of the patch lies inside both images or one of them is flat.
+    """
+    height, width = here.shape
+    side = len(range(-half, half + 1, stride))
+    for p in range(len(source)):
+        n = 0
+        sa = sb = saa = sbb = sab = 0.0
+        for dy in range(-half, half + 1, stride):
+            ya, yb = source[p, 1] + dy, target[p, 1] + dy
+            if ya < 0 or yb < 0 or ya >= height or yb >= height:
+                continue
+            for dx in range(-half, half + 1, stride):
+                xa, xb = source[p, 0] + dx, target[p, 0] + dx
+                if xa < 0 or xb < 0 or xa >= width or xb >= width:
+                    continue
+                a, b = float(here[ya, xa]), float(there[yb, xb])
+                n += 1
+                sa += a
+                sb += b
+                saa += a * a
+                sbb += b * b
+                sab += a * b
+        correlation[p] = np.nan
+        if 2 * n >= side * side:
+            va, vb = saa - sa * sa / n, sbb - sb * sb / n
+            if va > 1e-9 * max(saa, 1e-300) and vb > 1e-9 * max(sbb, 1e-300):
+                correlation[p] = (sab - sa * sb / n) / np.sqrt(va * vb)

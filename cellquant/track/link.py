@@ -12,7 +12,7 @@ from cellquant.track.baseline import trackpy_links
 from cellquant.track.diagnostics import describe
 from cellquant.track.gaps import close_gaps
 from cellquant.track.movie import FloatArray, IntArray, flatten
-from cellquant.track.solve import solve
+from cellquant.track.solve import Options, solve
 
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
@@ -142,13 +142,19 @@ def track_cells(
     else:
         solution = solve(
             movie,
-            divisions=divisions,
-            max_distance=np.inf if max_distance is None else max_distance,
+            Options(
+                divisions=divisions,
+                max_distance=np.inf if max_distance is None else max_distance,
+            ),
+            masks=masks,
+            raw=raw,
+            pixel_size=cells.pixel_size,
             progress=progress,
         )
-        after, second = solution.links.after.copy(), solution.links.second
-        linked = solution.links.before >= 0
-        confidence[linked] = solution.links.confidence[linked]
+        links = solution.links
+        assert links is not None
+        after, second = links.after.copy(), links.second
+        confidence[links.before >= 0] = links.confidence[links.before >= 0]
         end, start, sure = close_gaps(
             movie,
             solution,

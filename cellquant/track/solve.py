@@ -1,17 +1,21 @@
 """Passes over the movie: gains from the present model, best links, a better model."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cellquant.track.assign import match_with_divisions
 from cellquant.track.costs import (
+    Fates,
     Links,
     Motion,
     Paths,
     Rates,
     Shapes,
+    expected_steps,
+    fates,
     first_motion,
     fit_motion,
     fit_rates,
@@ -21,39 +25,68 @@ from cellquant.track.costs import (
     paths,
     suppose_divisions,
 )
-from cellquant.track.divisions import Divisions, fit_divisions, predicted_middle, propose
-from cellquant.track.flow import all_flows, nearest_cells
+from cellquant.track.cues import Cue, fit_cue
+from cellquant.track.divisions import Divisions, fit_divisions, propose
+from cellquant.track.flow import CANDIDATES, all_flows, nearest_cells
+from cellquant.track.images import CONTEXTS, PairImages
 from cellquant.track.kernels import marginals
-from cellquant.track.movie import FloatArray, IntArray, Movie
+from cellquant.track.movie import BoolArray, FloatArray, IntArray, Movie
+
+if TYPE_CHECKING:
+    from cellquant.io import ImageStack, LabelStack
 
 PASSES = 5
 _UNLIKELY = 1e-4  # links below this probability are not offered to the assignment
-_SURE = 0.9  # a cell whose mother is known with this probability needs no division
+_SURE = 0.99  # a cell whose mother is known with this probability needs no division
 _DIVISION_PASS = 1  # the first pass that looks for divisions
+_IMAGE_PASS = 2  # the first pass that looks at the images
+_SETTLED = 0.999  # cells whose partner is known with this probability need no image
+_CALIBRATION_CELLS = 4000  # compared in any case, to learn what images tell
 
 
 @dataclass(frozen=True)
-class Solution:
-    """Links with the model that they were judged by."""
+class Options:
+    """What the user decides, and the cues that can be left out to see what they bring."""
 
-    links: Links
-    paths: Paths
+    divisions: bool = True
+    max_distance: float = np.inf
+    use_neighbours: bool = True
+    use_path: bool = True
+    use_shape: bool = True
+    use_images: bool = True
+
+
+@dataclass
+class Solution:
+    """Links with the model that they were judged by; refined from pass to pass."""
+
+    movie: Movie
+    flow: FloatArray
+    candidates: IntArray
+    leaving: BoolArray
+    entering: BoolArray
+    known: Paths
     motion: Motion
     shapes: Shapes
     rates: Rates
-    divisions: Divisions | None
-    candidates: IntArray
-    gain: FloatArray
-    flow: FloatArray
-    leave: FloatArray
-    appear: FloatArray
+    links: Links | None = None
+    divisions: Divisions | None = None
+    probability: FloatArray | None = None
+    look: FloatArray | None = None
+    context: FloatArray | None = None
+    cue: Cue | None = None
+    family_cue: Cue | None = None
+    gain: FloatArray | None = None
+    fates: Fates | None = None
 
 
 def solve(
     movie: Movie,
+    options: Options,
     *,
-    divisions: bool,
-    max_distance: float,
+    masks: "LabelStack | None" = None,
+    raw: "ImageStack | None" = None,
+    pixel_size: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Solution:
     """Link the cells of successive frames.
@@ -62,108 +95,197 @@ def solve(
     ----------
     movie
         At least two frames with cells.
-    divisions
-        Look for divisions.
-    max_distance
-        Longest displacement that is considered.
+    options
+        Limits and cues.
+    masks
+        The masks that were measured; None leaves out image correlation.
+    raw
+        The recorded movie, or None.
+    pixel_size
+        Edge of a pixel in the unit of the positions.
     progress
         Called with the number of steps done and of all steps.
     """
     pairs = len(movie.time) - 1
     total = (PASSES + 1) * pairs
-    flow = all_flows(movie)
+    state = _start(movie, options)
+    images = None
     if progress is not None:
         progress(pairs, total)
-    candidates = np.full((movie.n_cells, nearest_width()), -1, dtype=np.int64)
-    for index in range(pairs):
+    for turn in range(PASSES):
+        if state.links is not None:
+            _refit(state, options, turn)
+        state.fates = fates(movie, state.links, state.rates, state.leaving, state.entering)
+        state.gain = gains(
+            movie,
+            state.candidates,
+            state.known,
+            state.motion,
+            state.shapes,
+            state.fates,
+            options.max_distance,
+        )
+        if masks is not None and options.use_images and turn >= _IMAGE_PASS:
+            if images is None:
+                ahead = expected_steps(movie, state.known, state.motion, own_path=True)
+                images = PairImages(movie, masks, raw, pixel_size, movie.position + ahead)
+            _add_images(state, images)
+        middle = movie.position + expected_steps(movie, state.known, state.motion, own_path=False)
+        if options.divisions and turn >= _DIVISION_PASS:
+            state.divisions = fit_divisions(
+                movie, state.links, middle, float(state.motion.scale[0])
+            )
+        state.links = _assign(state, middle, images)
+        if progress is not None:
+            progress((turn + 2) * pairs, total)
+    return state
+
+
+def _start(movie: Movie, options: Options) -> Solution:
+    flow = all_flows(movie, local=options.use_neighbours)
+    candidates = np.full((movie.n_cells, CANDIDATES), -1, dtype=np.int64)
+    for index in range(len(movie.time) - 1):
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
         found = nearest_cells(movie.position[a] + flow[a], movie.position[b])
         candidates[a] = np.where(found >= 0, found + movie.start[index + 1], -1)
     leaving, entering = near_edge(movie, flow)
-    links: Links | None = None
-    known = paths(movie, None, flow)
-    motion = first_motion(float(np.median(movie.spacing)))
     none = np.empty(0, dtype=np.int64)
-    shapes = fit_shapes(movie, none, none, np.empty(0))
-    rates = fit_rates(movie, None, leaving, entering)
-    model: Divisions | None = None
-    gain = np.empty(candidates.shape)
-    for turn in range(PASSES):
-        if links is not None:
-            known = paths(movie, links, flow)
-            motion = fit_motion(movie, links, known, motion)
-            single = np.flatnonzero((links.after >= 0) & (links.second < 0))
-            target = links.after[single]
-            shapes = fit_shapes(movie, single, target, links.confidence[target])
-            rates = fit_rates(movie, links, leaving, entering)
-            if divisions and turn == _DIVISION_PASS:
-                rates = suppose_divisions(rates)
-        gain, leave, appear = gains(
-            movie, candidates, known, motion, shapes, rates, leaving, entering, max_distance
-        )
-        middle = predicted_middle(movie, known, motion)
-        if divisions and turn >= _DIVISION_PASS:
-            model = fit_divisions(movie, links, middle, float(motion.scale[0]))
-        links = _assign(movie, candidates, gain, leave, appear, middle, model, motion, rates)
-        if progress is not None:
-            progress((turn + 2) * pairs, total)
-    assert links is not None
     return Solution(
-        links, known, motion, shapes, rates, model, candidates, gain, flow, leave, appear
+        movie=movie,
+        flow=flow,
+        candidates=candidates,
+        leaving=leaving,
+        entering=entering,
+        known=_paths(movie, None, flow, options),
+        motion=first_motion(float(np.median(movie.spacing))),
+        shapes=fit_shapes(movie, none, none, np.empty(0)),
+        rates=fit_rates(movie, None, leaving, entering),
     )
 
 
-def nearest_width() -> int:
-    from cellquant.track.flow import CANDIDATES
+def _paths(movie: Movie, links: Links | None, flow: FloatArray, options: Options) -> Paths:
+    known = paths(movie, links, flow)
+    if not options.use_path:
+        nobody = np.zeros_like(known.has_after)
+        known = replace(known, has_after=nobody, has_before=nobody)
+    if not options.use_neighbours:
+        nothing = np.zeros_like(known.around_after)
+        known = replace(known, around_after=nothing, around_before=nothing)
+    return known
 
-    return CANDIDATES
+
+def _refit(state: Solution, options: Options, turn: int) -> None:
+    movie, links = state.movie, state.links
+    assert links is not None
+    state.known = _paths(movie, links, state.flow, options)
+    state.motion = fit_motion(movie, links, state.known, state.motion)
+    single = np.flatnonzero((links.after >= 0) & (links.second < 0))
+    target = links.after[single]
+    if options.use_shape:
+        state.shapes = fit_shapes(movie, single, target, links.confidence[target])
+    state.rates = fit_rates(movie, links, state.leaving, state.entering)
+    if options.divisions and turn == _DIVISION_PASS:
+        state.rates = suppose_divisions(state.rates)
 
 
-def _assign(
-    movie: Movie,
-    candidates: IntArray,
-    gain: FloatArray,
-    leave: FloatArray,
-    appear: FloatArray,
-    middle: FloatArray,
-    model: Divisions | None,
-    motion: Motion,
-    rates: Rates,
-) -> Links:
+def _add_images(state: Solution, images: PairImages) -> None:
+    """Add image correlation to the gains, calibrated on the present links."""
+    movie, links, gain = state.movie, state.links, state.gain
+    assert links is not None
+    assert gain is not None
+    if state.look is None or state.context is None:
+        state.look, state.context = _compare(state, images)
+    targets = np.maximum(state.candidates, 0)
+    measured = np.isfinite(state.look).all(axis=2)
+    linked = (links.after[:, None] == state.candidates) & (links.second < 0)[:, None]
+    stranger = links.before[targets] != np.arange(movie.n_cells)[:, None]
+    stranger &= state.context[:, :, -1] < 1.0
+    state.cue = fit_cue(
+        state.look[measured], state.context[measured], linked[measured], stranger[measured]
+    )
+    if state.cue is not None:
+        gain[measured] += state.cue.odds(state.look[measured], state.context[measured])
+
+
+def _compare(state: Solution, images: PairImages) -> tuple[FloatArray, FloatArray]:
+    """Compare doubtful cells with their candidates, and a sample of the others to calibrate."""
+    movie, candidates = state.movie, state.candidates
+    assert state.probability is not None
+    best = state.probability.max(axis=1)
+    wanted = (best > _UNLIKELY) & (best < _SETTLED)
+    wanted[:: max(1, movie.n_cells // _CALIBRATION_CELLS)] = True
+    look = np.full((*candidates.shape, images.n_values), np.nan)
+    context = np.zeros((*candidates.shape, CONTEXTS))
+    for index in range(len(movie.time) - 1):
+        here = movie.cells_of(index)
+        row, column = np.nonzero(wanted[here, None] & (candidates[here] >= 0))
+        if len(row):
+            row += here.start
+            look[row, column], context[row, column] = images.pairs(
+                index, row, candidates[row, column]
+            )
+    return look, context
+
+
+def _families(
+    state: Solution, index: int, orphan: IntArray, middle: FloatArray, images: PairImages | None
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Divisions worth considering between frame `index` and the next, and their log odds."""
+    assert state.divisions is not None
+    assert state.fates is not None
+    cells, gain = propose(
+        state.movie,
+        index,
+        state.candidates,
+        orphan,
+        middle,
+        state.divisions,
+        float(state.motion.tail[0]),
+        state.fates.divide,
+        state.fates.vanish,
+        state.fates.appear,
+    )
+    if images is None or len(gain) == 0:
+        return cells, gain, np.empty((0, 0))
+    value, context = images.families(index, cells)
+    if state.family_cue is not None:
+        gain = gain + state.family_cue.odds(value, context)
+    return cells, gain, np.column_stack((value, context))
+
+
+def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> Links:
+    movie, candidates, gain = state.movie, state.candidates, state.gain
+    assert gain is not None
     n = movie.n_cells
     after = np.full(n, -1, dtype=np.int64)
     second, before = after.copy(), after.copy()
     confidence = np.zeros(n)
-    log_rate = float(np.log(rates.divide))
+    everywhere = state.probability = np.zeros(candidates.shape)
+    looks: list[FloatArray] = []
+    looks_taken: list[BoolArray] = []
     for index in range(len(movie.time) - 1):
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
         n_there = b.stop - b.start
         local = np.where(candidates[a] >= 0, candidates[a] - b.start, -1)
-        probability = np.empty(local.shape)
+        probability = everywhere[a]
         marginals(gain[a], local, n_there, 6, probability)
         row, column = np.nonzero(probability > _UNLIKELY)
         rows, columns = row + a.start, candidates[a][row, column]
         value = gain[a][row, column]
         families = np.empty((0, 3), dtype=np.int64)
-        odds = np.empty(0)
-        if model is not None:
+        odds, seen = np.empty(0), np.empty((0, 0))
+        if state.divisions is not None:
             reached = np.zeros(n_there)
             np.maximum.at(reached, local[row, column], probability[row, column])
             orphan = np.zeros(n, dtype=np.int64)
             orphan[b] = reached < _SURE
-            families, odds = propose(
-                movie,
-                index,
-                candidates,
-                orphan,
-                middle,
-                model,
-                float(motion.tail[0]),
-                log_rate,
-                leave,
-                appear,
-            )
+            families, odds, seen = _families(state, index, orphan, middle, images)
         chosen, split = match_with_divisions(rows, columns, value, families, odds)
+        if len(seen):
+            taken = np.zeros(len(seen), dtype=bool)
+            taken[split] = True
+            looks.append(seen)
+            looks_taken.append(taken)
         after[rows[chosen]] = columns[chosen]
         before[columns[chosen]] = rows[chosen]
         confidence[columns[chosen]] = probability[row[chosen], column[chosen]]
@@ -173,4 +295,7 @@ def _assign(
         confidence[families[split, 1]] = confidence[families[split, 2]] = 1.0 / (
             1.0 + np.exp(-np.minimum(odds[split], 50.0))
         )
+    if looks:
+        look, taken = np.concatenate(looks), np.concatenate(looks_taken)
+        state.family_cue = fit_cue(look[:, :-CONTEXTS], look[:, -CONTEXTS:], taken, ~taken)
     return Links(after, second, before, confidence)
