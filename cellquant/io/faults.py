@@ -144,7 +144,7 @@ def same_content(
 def _places(faults: FrameFaults) -> Floats:
     """Area and centroid of every label, in an order that does not depend on the numbers."""
     order = np.lexsort((faults.area, faults.x, faults.y))
-    return np.stack((faults.area, faults.x, faults.y))[:, order]
+    return np.stack((faults.area.astype(np.float64), faults.x, faults.y))[:, order]
 
 
 @nb.njit(cache=True)
