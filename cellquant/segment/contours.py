@@ -288,7 +288,6 @@ def _arc_length(steps, n, start, count, closed, points, ends):  # type: ignore[n
 def _lost_at_corner(turn):  # type: ignore[no-untyped-def]
     """Mean length (px) missed at a corner, less what fitting up to the corner adds.
 
-
     A row of pixels sees a tip only where its chord is at least one pixel long. For edges at
     angles alpha and beta to the row, alpha + beta = turn, the height missed is
     sin(alpha) sin(beta) / sin(turn), and along each edge that height times the sine of its
