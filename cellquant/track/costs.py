@@ -13,6 +13,7 @@ _TAILS = (2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SHAPE_TAIL = 5.0
 _SHAPE_FLOOR = 0.05
 _PRIOR_LINKS = 10.0
+_FIT_LINKS = 10000  # links that a fit looks at, evenly taken
 _PRIOR_SCALE = 0.15  # of the spacing
 _PRIOR_EVENTS = 2.0
 _PRIOR_RATE = 0.01
@@ -185,6 +186,7 @@ def first_motion(spacing: float) -> Motion:
 def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Motion:
     """Fit prediction and scatter to the links, robustly, each kind of path by itself."""
     source = np.flatnonzero((links.after >= 0) & (links.second < 0))
+    source = source[:: max(1, len(source) // _FIT_LINKS)]
     target = links.after[source]
     frames = np.searchsorted(movie.start, source, side="right") - 1
     elapsed = (movie.time[frames + 1] - movie.time[frames]).astype(np.float64)
@@ -248,9 +250,16 @@ def fit_shapes(movie: Movie, source: IntArray, target: IntArray, weight: FloatAr
     f = shape.shape[1]
     typical = np.median(shape, axis=0)
     typical[1:3] = 0.0
+    whole = ~movie.cut
+    if whole.any():
+        typical[[0, 3]] = np.median(shape[whole][:, [0, 3]], axis=0)
+    kept = whole[source] & whole[target]
+    source, target, weight = source[kept], target[kept], weight[kept]
+    thin = max(1, len(source) // _FIT_LINKS)
+    source, target, weight = source[::thin], target[::thin], weight[::thin]
     centred = shape - typical
     floor = _SHAPE_FLOOR**2 * np.eye(f)
-    population = _robust_covariance(centred, np.ones(len(shape))) + floor
+    population = _robust_covariance(centred[whole], np.ones(int(whole.sum()))) + floor
     if len(source) < 10 * f:
         precision = np.asarray(np.linalg.inv(population), dtype=np.float64)
         return Shapes(typical, np.zeros(f), precision, precision, 0.0)
@@ -269,6 +278,10 @@ def fit_shapes(movie: Movie, source: IntArray, target: IntArray, weight: FloatAr
 
 def _robust_covariance(values: FloatArray, weight: FloatArray) -> FloatArray:
     f = values.shape[1]
+    if len(values) == 0:
+        return np.eye(f)
+    thin = max(1, len(values) // (2 * _FIT_LINKS))
+    values, weight = values[::thin], weight[::thin]
     covariance = np.diag(np.average(values**2, axis=0, weights=weight) + 1e-9)
     for _ in range(6):
         d = np.einsum("nf,fg,ng->n", values, np.linalg.inv(covariance), values)
@@ -348,15 +361,18 @@ def fates(
     if links is not None:
         size = movie.shape[:, LOG_AREA]
         cell, last, first = np.arange(movie.n_cells), movie.start[-2], movie.start[1]
-        gone = (cell < last) & (links.after < 0)
-        split = (cell < last) & (links.second >= 0)
-        new = (cell >= first) & (links.before < 0)
-        usual = _size_law(size[(cell < last) & ~gone & ~split], None)
-        vanish = vanish * _size_ratio(size, size[gone], usual)
-        divide = divide * _size_ratio(size, size[split], usual)
+        # Cells cut by the edge have no size of their own.
+        whole = ~movie.cut
+        gone = (cell < last) & (links.after < 0) & whole
+        split = (cell < last) & (links.second >= 0) & whole
+        new = (cell >= first) & (links.before < 0) & whole
+        usual = _size_law(size[(cell < last) & whole & ~gone & ~split], None)
+        vanish = vanish * np.where(whole, _size_ratio(size, size[gone], usual), 1.0)
+        divide = divide * np.where(whole, _size_ratio(size, size[split], usual), 1.0)
         total = stay + vanish + divide
         stay, vanish, divide = stay / total, vanish / total, divide / total
-        appear = np.minimum(appear * _size_ratio(size, size[new], usual), 0.5)
+        seen = np.where(whole, _size_ratio(size, size[new], usual), 1.0)
+        appear = np.minimum(appear * seen, 0.5)
     return Fates(
         np.log(np.maximum(stay, 1e-6)),
         np.log(np.maximum(vanish, 1e-9)),
@@ -407,6 +423,7 @@ def gains(
     pair_gains(
         movie.position,
         movie.shape,
+        movie.cut,
         candidates,
         elapsed,
         paths.own_before,

@@ -140,6 +140,7 @@ def propose(
     found = division_gains(
         movie.position,
         movie.shape,
+        movie.cut,
         candidates,
         orphan,
         middle,

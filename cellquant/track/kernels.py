@@ -7,6 +7,7 @@ from numba import njit
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 @njit(cache=True)
@@ -155,6 +156,7 @@ def marginals(
 def pair_gains(
     position: FloatArray,
     shape: FloatArray,
+    cut: BoolArray,
     candidates: IntArray,
     elapsed: FloatArray,
     own_before: FloatArray,
@@ -183,7 +185,7 @@ def pair_gains(
 
     gain (N, K); candidates (N, K) with -1 where there is none. The residual of the displacement
     from its prediction has a two-dimensional Student density; so has the change of shape, against
-    the density of shapes in the population.
+    the density of shapes in the population, unless the edge of the view cuts one of them.
     """
     n, k = candidates.shape
     f = shape.shape[1]
@@ -219,6 +221,9 @@ def pair_gains(
             nu = tail[kind]
             distance = (rx * rx + ry * ry) * elapsed[i] * elapsed[i] / (width * width * nu)
             value = -np.log(2 * np.pi * width * width) - (nu / 2 + 1) * np.log1p(distance)
+            if cut[i] or cut[j]:
+                gain[i, c] = value + stay[i] - leave[i] - appear[j]
+                continue
             near = 0.0
             far = 0.0
             for d in range(f):
@@ -241,6 +246,7 @@ def pair_gains(
 def division_gains(
     position: FloatArray,
     shape: FloatArray,
+    cut: BoolArray,
     candidates: IntArray,
     orphan: IntArray,
     middle: FloatArray,
@@ -272,11 +278,11 @@ def division_gains(
     for i in range(first, last):
         for c in range(k):
             j = candidates[i, c]
-            if j < 0 or not orphan[j]:
+            if j < 0 or not orphan[j] or cut[j]:
                 continue
             for d in range(k):
                 h = candidates[i, d]
-                if h < 0 or h == j or (orphan[h] and h < j):
+                if h < 0 or h == j or cut[h] or (orphan[h] and h < j):
                     continue
                 dx = position[h, 0] - position[j, 0]
                 dy = position[h, 1] - position[j, 1]

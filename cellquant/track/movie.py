@@ -44,6 +44,8 @@ class Movie:
         (N,) cells per area around each cell.
     margin
         (N,) distance to the edge of the field of view.
+    cut
+        (N,) whether the cell touches that edge, so that its shape is not its own.
     """
 
     position: FloatArray
@@ -56,6 +58,7 @@ class Movie:
     spacing: FloatArray
     density: FloatArray
     margin: FloatArray
+    cut: BoolArray
     field_of_view: tuple[float, float]
 
     @property
@@ -106,6 +109,7 @@ def flatten(cells: Cells) -> Movie:
         spacing=spacing,
         density=density,
         margin=margin,
+        cut=table["touches_border"].to_numpy(np.bool_),
         field_of_view=(width, height),
     )
 

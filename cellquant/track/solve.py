@@ -214,11 +214,13 @@ def _compare(state: Solution, images: PairImages) -> tuple[FloatArray, FloatArra
     best = state.probability.max(axis=1)
     wanted = (best > _UNLIKELY) & (best < _SETTLED)
     wanted[:: max(1, movie.n_cells // _CALIBRATION_CELLS)] = True
+    wanted &= ~movie.cut
+    whole = (candidates >= 0) & ~movie.cut[candidates]
     look = np.full((*candidates.shape, images.n_values), np.nan)
     context = np.zeros((*candidates.shape, CONTEXTS))
     for index in range(len(movie.time) - 1):
         here = movie.cells_of(index)
-        row, column = np.nonzero(wanted[here, None] & (candidates[here] >= 0))
+        row, column = np.nonzero(wanted[here, None] & whole[here])
         if len(row):
             row += here.start
             look[row, column], context[row, column] = images.pairs(
