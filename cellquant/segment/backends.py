@@ -245,7 +245,7 @@ def _tidy(labels: Array, diameter: float) -> np.ndarray[Any, np.dtype[np.int32]]
 
 def _estimate_diameter(name: str, image: Array, modality: str) -> float:
     """Diameter of the cells in a frame, px: from the median width of what a rough pass finds."""
-    guess = max(min(image.shape) / 25.0, 4.0)
+    guess: float = max(min(image.shape) / 25.0, 4.0)
     kind: Literal["phase_contrast", "fluorescence"] = (
         "fluorescence" if modality == "fluorescence" else "phase_contrast"
     )
