@@ -1,14 +1,22 @@
 """Ranking and estimation of parameters: known answers come back, doubt is admitted."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+import cellquant as cq
 from cellquant.compare.groups import Group, read_groups
 from cellquant.compare.inference import fit_parameters, sensitivity, train
-from cellquant.compare.ranking import REDUCED_UNITS, Units, features_of, rank_candidates
+from cellquant.compare.ranking import (
+    REDUCED_UNITS,
+    Units,
+    features_of,
+    rank_candidates,
+    units_of_file,
+)
 from cellquant.compare.results import Result
 from cellquant.errors import InputError
 
@@ -145,7 +153,7 @@ def test_known_parameters_come_back(sweep: list[Group]) -> None:
             sweep,
             units=REDUCED_UNITS,
             emulator=emulator,
-            n_points=1024,
+            n_points=512,
         )
         inside += found.contains(truth)
         low, _, high = found.interval("v0")
@@ -156,7 +164,7 @@ def test_known_parameters_come_back(sweep: list[Group]) -> None:
 
 
 def test_region_does_not_hold_a_wrong_answer(sweep: list[Group]) -> None:
-    found = fit_parameters(target(0.92, 0.05, 0.02, 4), sweep, units=REDUCED_UNITS, n_points=1024)
+    found = fit_parameters(target(0.92, 0.05, 0.02, 4), sweep, units=REDUCED_UNITS)
     assert not found.contains({"phi": 0.92, "v0": 0.02, "eta": 0.02})
     assert not found.at_edge("v0")
     effect = sensitivity(found)
@@ -189,14 +197,12 @@ def test_parameters_of_simulated_layers_come_back() -> None:
     """Reduced problem: 36 cells for 100 t0; 64 scenes to learn from, 20 to recover."""
     from scipy.stats import qmc
 
-    import cellquant as cq
-
     low, high = np.array([0.88, 0.02, 0.01]), np.array([1.0, 0.08, 0.06])
 
     def layer(point: np.ndarray, seed: int) -> Group:
         phi, v0, eta = (float(v) for v in point)
         scene = cq.Scene(phi=phi, v0=v0, eta=eta, n_cells=36, seed=seed)
-        run = cq.simulate(scene, duration=100.0, transient=40.0, dt=0.04, save_every=2.0)
+        run = cq.simulate(scene, duration=100.0, transient=40.0, dt=0.01, save_every=2.0)
         found = cq.observe(run, only=["shape_index", "speed", "msd"])
         known = {"phi": phi, "v0": v0, "eta": eta}
         result = Result(f"seed {seed}", found.summary, found.tables, {"settings": known})
@@ -215,3 +221,46 @@ def test_parameters_of_simulated_layers_come_back() -> None:
         found = fit_parameters(wanted, sweep, units=REDUCED_UNITS, emulator=emulator)
         inside += found.contains(wanted.scene)
     assert inside >= 18
+
+
+def test_fit_is_part_of_the_comparison(sweep: list[Group], tmp_path: Path) -> None:
+    wanted = toy(0.93, 0.04, 0.02, seed=3, scale=2.0)
+    scenes = [group.members[0] for group in sweep]
+    units = Units((20.0, 0.2), (1 / 6, 0.002))
+    one, two = (
+        cq.compare(wanted, *scenes, fit=True, units=units, seed=1) for _ in range(2)
+    )  # fmt: skip
+    one.to_json(tmp_path / "one.json")
+    two.to_json(tmp_path / "two.json")
+    assert (tmp_path / "one.json").read_bytes() == (tmp_path / "two.json").read_bytes()
+    one.to_html(tmp_path / "one.html")
+    two.to_html(tmp_path / "two.html")
+    assert (tmp_path / "one.html").read_bytes() == (tmp_path / "two.html").read_bytes()
+    (fit,) = one.as_dict()["fits"]
+    low, high = fit["parameters"]["v0"]["interval_95"]
+    assert low < 0.04 < high
+    assert len(fit["ranking"]) == len(sweep)
+    page = (tmp_path / "one.html").read_text()
+    assert "Parameters that match" in page
+    assert 'data-name="posterior-1-v0"' in page
+
+
+def test_too_few_scenes_are_ranked_but_not_fitted(sweep: list[Group], tmp_path: Path) -> None:
+    scenes = [group.members[0] for group in sweep[:4]]
+    comparison = cq.compare(toy(0.93, 0.04, 0.02, seed=3, scale=2.0), *scenes, fit=True)
+    (fit,) = comparison.as_dict()["fits"]
+    assert fit["parameters"] is None
+    assert "needs eight or more" in fit["reason"]
+    comparison.to_html(tmp_path / "r.html")
+    assert "Parameters were not estimated" in (tmp_path / "r.html").read_text()
+
+
+def test_units_file_must_fix_length_and_time(tmp_path: Path) -> None:
+    path = tmp_path / "units.toml"
+    path.write_text("[measured]\nL0 = { value = 20, std_error = 1 }\nt0 = 12\n")
+    units = units_of_file(path)
+    assert units.length == (20.0, 1.0)
+    assert units.time == (pytest.approx(0.2), 0.0)
+    path.write_text("[measured]\nL0 = 20\n")
+    with pytest.raises(InputError, match="does not fix t0"):
+        units_of_file(path)

@@ -58,6 +58,18 @@ def compare(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="The HTML page; comparison.json goes beside it.")
     ],
+    fit: Annotated[
+        bool,
+        typer.Option("--fit", help="Rank the scenes of a sweep and estimate phi, v0 and eta."),
+    ] = False,
+    units: Annotated[
+        Path | None,
+        typer.Option(
+            help="Units file that fixes L0 and t0 (see convert-units), so that the fit may use "
+            "lengths and times."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the fit.")] = 0,
 ) -> None:
     """Put experiments and simulations side by side: a report, and comparison.json beside it."""
     from cellquant.compare import compare as compare_results
@@ -65,7 +77,12 @@ def compare(
 
     check_output(output.parent)
     with step("compare"):
-        comparison = compare_results(*sources)
+        known = None
+        if units is not None:
+            from cellquant.compare.ranking import units_of_file
+
+            known = units_of_file(units)
+        comparison = compare_results(*sources, fit=fit, units=known, seed=seed)
         comparison.to_html(output)
         comparison.to_json(output.with_name("comparison.json"))
     for first, second in comparison.pairs():
@@ -75,6 +92,8 @@ def compare(
             counts[verdict.verdict] += 1
         found = ", ".join(f"{count} {word}" for word, count in counts.items())
         say(f"{first.name} and {second.name}: {found}")
+    for found_fit in comparison.fits:
+        say(f"{found_fit.target}: {found_fit.ranking.statement()}")
     note(f"wrote {output} and {output.with_name('comparison.json')}")
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cellquant import __version__
 from cellquant.compare.groups import Group, read_groups
@@ -12,6 +12,10 @@ from cellquant.compare.results import Scalar, look_up
 from cellquant.compare.units import STERIC_AREA, packing_fraction_of
 from cellquant.errors import InputError
 from cellquant.storage import write_json
+
+if TYPE_CHECKING:
+    from cellquant.compare.fit import Fit
+    from cellquant.compare.ranking import Units
 
 AGREE = "agree within errors"
 DIFFER = "differ"
@@ -108,10 +112,13 @@ class Comparison:
         Experiments first.
     area
         Steric cell area and its standard error, um^2, behind the effective packing fraction.
+    fits
+        Which scenes and parameters match each experiment, where that was asked for.
     """
 
     groups: tuple[Group, ...]
     area: tuple[float, float] = STERIC_AREA
+    fits: "tuple[Fit, ...]" = ()
 
     @property
     def experiments(self) -> tuple[Group, ...]:
@@ -153,6 +160,7 @@ class Comparison:
                 }
                 for first, second in self.pairs()
             ],
+            "fits": [fit.as_dict() for fit in self.fits],
         }
 
     def to_json(self, path: str | Path) -> None:
@@ -171,6 +179,9 @@ def compare(
     *sources: Any,
     names: Sequence[str] | None = None,
     steric_area: tuple[float, float] = STERIC_AREA,
+    fit: bool = False,
+    units: "Units | None" = None,
+    seed: int = 0,
 ) -> Comparison:
     """Hold experiments and simulations against each other.
 
@@ -184,6 +195,13 @@ def compare(
     steric_area
         Area that a cell takes in a dense layer and its standard error, um^2; by default that of
         HeLa cells, anywhere from 400 to 500.
+    fit
+        Whether to rank the simulated scenes and estimate phi, v0 and eta for each experiment (for
+        the first group where all are simulated).
+    units
+        L0 and t0 in the experiments' units, for the fit; pure numbers only when None.
+    seed
+        Seed of the fit.
 
     Returns
     -------
@@ -203,7 +221,12 @@ def compare(
         )
     if not (steric_area[0] > 0 and steric_area[1] >= 0):
         raise InputError(f"steric_area must be > 0 um^2 with an error >= 0, got {steric_area}.")
-    return Comparison(tuple(groups), steric_area)
+    comparison = Comparison(tuple(groups), steric_area)
+    if not fit:
+        return comparison
+    from cellquant.compare.fit import fit_groups
+
+    return replace(comparison, fits=tuple(fit_groups(comparison, units=units, seed=seed)))
 
 
 def judge(first: Matched, second: Matched) -> Verdict:

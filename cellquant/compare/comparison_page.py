@@ -15,6 +15,7 @@ from cellquant.compare.comparison import (
     matched_scalars,
     unit_mapping,
 )
+from cellquant.compare.fit import fit_sections
 from cellquant.compare.groups import Group
 from cellquant.compare.matched_figures import (
     MAX_PICTURES,
@@ -62,6 +63,7 @@ def build_comparison(comparison: Comparison) -> Page:
                  [displacement_figure(groups), hove_figure(groups),
                   boxes_figure(groups, "speed", "speed")], _MOTION),
         _figures("maps", "Maps over activity and line tension", map_figures(groups), _MAPS),
+        *fit_sections(comparison.fits),
         _units_section(comparison, pairs),
         _limits_section(pairs, groups),
         _methods(groups),

@@ -123,27 +123,32 @@ def _groups_of(source: Any, name: str) -> list[Group]:
             f"{folder} holds no summary.json, nor does any folder below it; give a folder that "
             "'cellquant observe', 'run' or 'sweep' has written."
         )
-    trials: dict[str, dict[str, list[Result]]] = {
-        f"{name}: {group}" if name else group: {} for group in _conditions(folder)
-    }
-    scenes: dict[str, Mapping[str, float]] = {}
+    found: dict[str, dict[str, list[Result]]] = {group: {} for group in _conditions(folder)}
+    labels: dict[str, tuple[str, Mapping[str, float]]] = {}
     for path in paths:
         result = read_result(path)
         scene = scene_of(result)
         group, trial = _place(result, path.relative_to(folder), scene)
-        label = f"{name}: {group}" if name and group else name or group
-        trials.setdefault(label, {}).setdefault(trial, []).append(result)
-        scenes[label] = scene
-    return [
+        # Scenes that differ in anything but the seed are not replicates of each other.
+        key = group if not scene else json.dumps(_without_seed(result.record), sort_keys=True)
+        found.setdefault(key, {}).setdefault(trial, []).append(result)
+        labels[key] = (f"{name}: {group}" if name and group else name or group, scene)
+    groups = [
         Group(
-            label,
+            labels[key][0],
             next(iter(members.values()))[0].simulated,
             {trial: tuple(results) for trial, results in members.items()},
-            scenes[label],
+            labels[key][1],
         )
-        for label, members in trials.items()
+        for key, members in found.items()
         if members
     ]
+    return sorted(groups, key=lambda group: tuple(group.scene.values()))
+
+
+def _without_seed(record: Mapping[str, Any]) -> dict[str, Any]:
+    settings = record.get("settings", {})
+    return {k: v for k, v in settings.items() if k not in {"seed", "key", "folder", "source"}}
 
 
 def _conditions(folder: Path) -> list[str]:

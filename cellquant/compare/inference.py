@@ -30,6 +30,10 @@ class Posterior:
         Features used.
     bounds
         Range of each parameter in the sweep, the support of the flat prior.
+    emulator
+        What the likelihood was computed with.
+    target
+        Features of the target and their covariance.
     """
 
     names: tuple[str, ...]
@@ -94,14 +98,14 @@ class Emulator:
         return np.column_stack([p[0] for p in pairs]), deviation
 
     def log_likelihood(
-        self, points: FloatArray, value: FloatArray, error: FloatArray
+        self, points: FloatArray, value: FloatArray, covariance: FloatArray
     ) -> FloatArray:
         """Logarithm of the probability of the observed features at each point."""
         mean, deviation = self.predict(points)
-        covariance = np.repeat((self.correlation * np.outer(error, error))[None], len(points), 0)
+        total = np.repeat(covariance[None], len(points), 0)
         diagonal = np.arange(len(value))
-        covariance[:, diagonal, diagonal] += deviation**2
-        factor = np.linalg.cholesky(covariance)
+        total[:, diagonal, diagonal] += deviation**2
+        factor = np.linalg.cholesky(total)
         z = np.linalg.solve(factor, (value - mean)[..., None])[..., 0]
         volume = np.log(factor[:, diagonal, diagonal]).sum(axis=1)
         out: FloatArray = -0.5 * (z**2).sum(axis=1) - volume
@@ -125,6 +129,8 @@ def train(candidates: Sequence[Group], features: Sequence[str], *, seed: int = 0
     InputError
         If there are fewer than eight scenes, or no parameter varies.
     """
+    from threadpoolctl import threadpool_limits
+
     tables = [features_of(group, REDUCED_UNITS) for group in candidates]
     known = [
         (group, table)
@@ -144,9 +150,11 @@ def train(candidates: Sequence[Group], features: Sequence[str], *, seed: int = 0
     values = np.array([[table[f].value for f in features] for _, table in known])
     errors = np.array([[table[f].std_error for f in features] for _, table in known])
     scaled = _scaled(points, low, high)
-    models = tuple(
-        _gaussian_process(scaled, values[:, i], errors[:, i], seed) for i in range(len(features))
-    )
+    with threadpool_limits(1):
+        models = tuple(
+            _gaussian_process(scaled, values[:, i], errors[:, i], seed)
+            for i in range(len(features))
+        )
     widen = np.array([_left_out_spread(model) for model in models])
     correlation = _correlation([group for group, _ in known], features)
     return Emulator(names, tuple(features), models, widen, low, high, correlation)
@@ -194,6 +202,7 @@ def fit_parameters(
     Kennedy & O'Hagan, J. R. Stat. Soc. B 63, 425 (2001), doi:10.1111/1467-9868.00294.
     """
     from scipy.stats import qmc
+    from threadpoolctl import threadpool_limits
 
     if emulator is None:
         emulator = train(candidates, common_features(target, candidates, units)[0], seed=seed)
@@ -205,16 +214,19 @@ def fit_parameters(
             "the emulator without."
         )
     value = np.array([ours[f].value for f in emulator.features])
-    error = np.array([ours[f].std_error for f in emulator.features])
+    error = np.array([ours[f].own_error for f in emulator.features])
+    shared = np.array([ours[f].unit_error for f in emulator.features])
+    covariance = emulator.correlation * np.outer(error, error) + shared @ shared.T
     low, high = emulator.low, emulator.high
     start = low + qmc.Sobol(len(low), seed=seed).random(n_points) * (high - low)
-    samples, density = _sample(
-        lambda points: emulator.log_likelihood(points, value, error),
-        start,
-        low,
-        high,
-        np.random.default_rng(seed),
-    )
+    with threadpool_limits(1):  # the matrices are too small for more to pay
+        samples, density = _sample(
+            lambda points: emulator.log_likelihood(points, value, covariance),
+            start,
+            low,
+            high,
+            np.random.default_rng(seed),
+        )
     bounds = {n: (float(a), float(b)) for n, a, b in zip(emulator.names, low, high, strict=True)}
     return Posterior(
         emulator.names,
@@ -223,7 +235,7 @@ def fit_parameters(
         emulator.features,
         bounds,
         emulator,
-        (value, error),
+        (value, covariance),
     )
 
 
@@ -367,10 +379,11 @@ def sensitivity(posterior: Posterior) -> dict[str, dict[str, float]]:
     """
     middle = np.array([posterior.interval(name)[1] for name in posterior.names])
     out: dict[str, dict[str, float]] = {feature: {} for feature in posterior.features}
+    deviation = np.sqrt(np.diag(posterior.target[1]))
     for i, name in enumerate(posterior.names):
         ends = np.array([middle, middle])
         ends[:, i] = posterior.bounds[name]
         mean, _ = posterior.emulator.predict(ends)
         for j, feature in enumerate(posterior.features):
-            out[feature][name] = float((mean[1, j] - mean[0, j]) / posterior.target[1][j])
+            out[feature][name] = float((mean[1, j] - mean[0, j]) / deviation[j])
     return out

@@ -7,12 +7,14 @@ units of its uncertainty, in which the errors of both sides are combined.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cellquant.compare.groups import Group
 from cellquant.compare.results import look_up
+from cellquant.compare.units import convert_units_file
 from cellquant.errors import InputError
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
@@ -32,6 +34,28 @@ class Units:
 
 REDUCED_UNITS = Units((1.0, 0.0), (1.0, 0.0))
 
+
+def units_of_file(path: str | Path) -> Units:
+    """L0 in um and t0 in min from a units file (`cellquant.compare.units`).
+
+    Raises
+    ------
+    InputError
+        If the file is wrong, or L0 or t0 does not follow from it.
+    """
+    converted = convert_units_file(path)["measured"]
+    for name in ("L0", "t0"):
+        if name not in converted:
+            raise InputError(
+                f"{path} does not fix {name}; give it, or what it follows from "
+                "('cellquant convert-units' says what is missing)."
+            )
+    length, time = converted["L0"], converted["t0"]
+    return Units(
+        (length["value"], length["std_error"]), (time["value"] / 60, time["std_error"] / 60)
+    )
+
+
 # Pure numbers, and numbers with a unit as (key, power of length, power of time, logarithm).
 _PURE = ("shape_index.mean", "shape_index.std", "shape_index.skewness", "van_hove.sigma2",
          "van_hove.xi", "msd.exponent", "alpha2_peak.value")  # fmt: skip
@@ -45,10 +69,27 @@ MAX_INTERVAL_RATIO = 1.5  # of the frame intervals of two speeds that may be com
 
 @dataclass(frozen=True)
 class Feature:
-    """A number of one group, in reduced units; positive scale-like ones as their logarithm."""
+    """A number of one group, in reduced units; positive scale-like ones as their logarithm.
+
+    Attributes
+    ----------
+    value
+        The number.
+    own_error
+        Its standard error without that of the units.
+    unit_error
+        What the errors of L0 and of t0 add to it, with their sign: shared with every other
+        feature of the group that carries these units.
+    """
 
     value: float
-    std_error: float
+    own_error: float
+    unit_error: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def std_error(self) -> float:
+        """Standard error, that of the units included."""
+        return math.hypot(self.own_error, *self.unit_error)
 
 
 def features_of(group: Group, units: Units | None) -> dict[str, Feature]:
@@ -74,12 +115,12 @@ def features_of(group: Group, units: Units | None) -> dict[str, Feature]:
         if scalar is None or not scalar.value > 0 or not scalar.std_error > 0:
             continue
         unit = units.length[0] ** length * units.time[0] ** time
-        relative = math.hypot(
-            scalar.std_error / scalar.value,
-            length * units.length[1] / units.length[0],
-            time * units.time[1] / units.time[0],
+        shared = (
+            -length * units.length[1] / units.length[0],
+            -time * units.time[1] / units.time[0],
         )
-        found[key] = Feature(math.log(scalar.value / unit), relative)
+        own = scalar.std_error / scalar.value
+        found[key] = Feature(math.log(scalar.value / unit), own, shared)
     return found
 
 

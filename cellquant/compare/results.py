@@ -222,11 +222,12 @@ def with_sources(result: Result) -> Result:
         try:
             if found.tracks is None and (place / "tracks.parquet").is_file():
                 found = replace(found, tracks=read_tracks(place))
-            elif found.run is None and (place / "zarr.json").is_file():
-                from cellquant.sim import open_run
+            for zarr in (place, place / "run.zarr"):
+                if found.run is None and (zarr / "zarr.json").is_file():
+                    from cellquant.sim import open_run
 
-                run = open_run(place)
-                found = replace(found, run=run, tracks=run.to_tracks())
+                    run = open_run(zarr)
+                    found = replace(found, run=run, tracks=run.to_tracks())
         except (InputError, OSError):
             continue
     for record in records:
@@ -240,19 +241,18 @@ def _masks_of(record: Mapping[str, Any], folder: Path) -> "LabelStack | None":
 
     settings = record.get("settings", {})
     named = [settings.get("masks"), *record.get("inputs", {})]
-    if settings.get("pixel_size") is None and "calibration" not in settings:
-        return None
+    calibration = settings.get("calibration", settings)
     for path in [Path(name) for name in named if isinstance(name, str)]:
         for place in (path, folder / path.name):
             if not place.exists() or place.suffix in {".parquet", ".toml", ".json", ".zarr"}:
                 continue
             try:
-                if settings.get("length_unit") == "px":
+                if {"px", "pixel"} & {calibration.get("length_unit"), calibration.get("units")}:
                     return read_labels(place, units="pixel")
                 return read_labels(
                     place,
-                    pixel_size=settings.get("pixel_size"),
-                    frame_interval=settings.get("frame_interval"),
+                    pixel_size=calibration.get("pixel_size"),
+                    frame_interval=calibration.get("frame_interval"),
                 )
             except (InputError, OSError):
                 continue
