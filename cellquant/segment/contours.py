@@ -1,7 +1,18 @@
 """Sub-pixel contours of labelled cells: area, perimeter, moments and neighbours.
 
 A contour is followed along the cracks between the pixels of a cell and all others, the cell on
-the right-hand side. Everything is measured on that one closed path.
+the right-hand side; everything is measured on that one closed path. Its length is that of a curve
+through overlapping digital straight segments, which are long where the contour is straight and
+short where it bends, so that nothing has to be known of the size of the cells. Where the label
+beside the cell changes, the contour may have a corner: segments end there, and the length that
+pixels miss at the tip is added.
+
+References
+----------
+Debled-Rennesson & Reveilles, Int. J. Pattern Recognition and Artificial Intelligence 9, 635
+(1995), doi:10.1142/S0218001495000249: recognition of digital straight segments.
+Lachaud, Vialard & de Vieilleville, Image and Vision Computing 25, 1572 (2007),
+doi:10.1016/j.imavis.2006.06.019: averages over maximal segments.
 """
 
 from typing import Any, NamedTuple
