@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +34,7 @@ Progress = Callable[[int, int], None]
 ROOT_DEPTH = 2  # a root of the Brownian tree spans 2^2 steps
 WATCH_EVERY = 16  # steps between two checks of the step length
 CHATTER_LIMIT = 0.02  # RMS change of the displacement from one step to the next, L0
+CELLS_PER_THREAD = 256  # a thread with fewer cells waits longer than it works
 CHECKPOINT_EVERY = 20.0  # seconds of wall time
 FRAMES_IN_MEMORY = 2_000_000  # numbers of buffered frames before they are written
 
@@ -239,6 +241,8 @@ class _Simulation:
         total = (plan.n_before + plan.n_frames - 1) * frame_interval
         last_write = time.monotonic()
         clock = time.process_time()
+        threads = numba.get_num_threads()
+        numba.set_num_threads(max(1, min(threads, len(self.state) // CELLS_PER_THREAD)))
         try:
             while True:
                 frame = self.interval - plan.n_before
@@ -264,6 +268,8 @@ class _Simulation:
             self.cpu += time.process_time() - clock
             self._write_frames()
             raise
+        finally:
+            numba.set_num_threads(threads)
         self.cpu += time.process_time() - clock
         self._write()
         self.group.attrs.update({"status": "complete", "failure": None})
