@@ -1,22 +1,48 @@
-"""The main job on the embedded recording: masks to tracks to observables to a report."""
+"""The main job: the embedded recording from masks to numbers, and a loop with known truth."""
 
 import shutil
+from dataclasses import replace
 from importlib.resources import as_file, files
+from math import isnan
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from cellquant.closed_loop import LENGTH, PIXEL, TIME, Loop, close_loop
+from cellquant.config import SceneConfig
 from cellquant.pipeline import Step, observe_into, silent, track_movie
-from cellquant.storage import atomic_path, check_output, write_json
+from cellquant.storage import RunRecord, atomic_path, check_output, write_json
+
+if TYPE_CHECKING:
+    from cellquant.compare.page import Page, Section
+
+
+def demo_scene(seed: int) -> SceneConfig:
+    """A small layer that relaxes within the run."""
+    return SceneConfig(
+        cells=100,
+        phi=0.95,
+        v0=0.05,
+        eta=0.01,
+        rotational_diffusion=0.05,
+        transient=40,
+        duration=240,
+        save_every=4,
+        dt=0.02,
+        seed=seed,
+    )
 
 
 def run_demo(out: str | Path, *, seed: int = 1, step: Step = silent) -> Path:
-    """Analyse the embedded recording and write everything into one folder.
+    """Analyse the embedded recording, close the loop on a simulated layer, and report both.
 
     Parameters
     ----------
     out
-        Output folder: the masks, the tables, ``summary.json`` and ``report.html``.
+        Output folder: ``report.html``; ``recording`` with the masks, tables and ``summary.json``
+        of the embedded recording; ``layer`` with the simulated run, its masks, and what was
+        measured on both.
     seed
-        Seed of the bootstrap errors.
+        Seed of the simulated layer.
     step
         Gives a progress callback for each stage.
 
@@ -30,10 +56,29 @@ def run_demo(out: str | Path, *, seed: int = 1, step: Step = silent) -> Path:
     InputError
         If the output cannot be written.
     """
-    from cellquant.compare.report import experiment_report
-    from cellquant.io import inspect_labels, read_labels
+    from cellquant.compare.page import write_page
 
     folder = check_output(out)
+    record = RunRecord("demo", {"seed": seed})
+    page = _analyse_recording(folder / "recording", record, step)
+    scene = demo_scene(seed)
+    loop = close_loop(scene, folder / "layer", step=step)
+    record.stages += loop.record.stages
+    report = folder / "report.html"
+    with record.stage("report"), step("report"):
+        *sections, methods = page.sections
+        section = _loop_section(folder / "layer", loop, scene)
+        write_page(replace(page, sections=(*sections, section, methods)), report)
+    record.write(folder)
+    return report
+
+
+def _analyse_recording(folder: Path, record: RunRecord, step: Step) -> "Page":
+    """From the masks of the embedded recording to its report."""
+    from cellquant.compare.report import build_report
+    from cellquant.compare.results import read_result
+    from cellquant.io import inspect_labels, read_labels
+
     with as_file(files("cellquant") / "demo_data") as embedded:
         for name in ("masks.tif", "NOTICE.md"):
             with atomic_path(folder / name) as path:
@@ -41,20 +86,74 @@ def run_demo(out: str | Path, *, seed: int = 1, step: Step = silent) -> Path:
     masks = read_labels(folder / "masks.tif", units="pixel")
     with step("inspect") as progress:
         write_json(folder / "inspection.json", inspect_labels(masks, progress=progress).as_dict())
-    cells, tracks, record = track_movie(masks, folder, step=step)
-    observables = observe_into(tracks, folder, record, step=step)
-    record.command = "demo"
-    record.settings = {**record.settings, "seed": seed}
-    report = folder / "report.html"
-    with record.stage("report"), step("report"):
-        experiment_report(
-            title="T98G glioma cells, phase contrast",
-            tracks=tracks,
-            observables=observables,
-            settings=record.as_dict(),
-            out=report,
-            stack=masks,
-            cells=cells,
+    cells, tracks, made = track_movie(masks, folder, step=step)
+    observables = observe_into(tracks, folder, made, step=step)
+    made.command = "demo"
+    made.settings = {**record.settings, **made.settings}
+    made.write(folder)
+    record.stages += made.stages
+    title = "T98G glioma cells, phase contrast"
+    return build_report(
+        title=title,
+        tracks=tracks,
+        result=read_result(observables, name=title),
+        settings=made.as_dict(),
+        stack=masks,
+        cells=cells,
+    )
+
+
+def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
+    """The closed loop on the page: the table of errors and the two sides in matched figures."""
+    from cellquant.compare import matched_figures
+    from cellquant.compare.groups import read_groups
+    from cellquant.compare.page import Row, Section, Table, format_value
+    from cellquant.compare.results import pretty_unit
+
+    rows = []
+    for record in loop.table.to_dict("records"):
+        row: dict[str, Any] = {str(name): value for name, value in record.items()}
+        errors = [float(row[name]) for name in ("error", "from_field", "from_masks")]
+        rows.append(
+            Row(
+                (
+                    row["quantity"],
+                    format_value(row["truth"], row["truth_std_error"]),
+                    format_value(row["measured"], row["measured_std_error"]),
+                    "" if row["unit"] == "1" else pretty_unit(row["unit"]),
+                    *("not known" if isnan(e) else f"{100 * e:+.2f} %" for e in errors),
+                ),
+                "none" if isnan(errors[0]) else "",
+            )
         )
-    record.write(folder)
-    return report
+    table = Table(
+        name="closed-loop",
+        caption="Truth and measurement of the same layer, value ± standard error, in units of the "
+        "model. The error splits into what the field of view costs (borders, a finite window, "
+        "cells that leave) and what the masks cost (pixels and linking).",
+        columns=("Quantity", "Truth", "Measured", "Unit", "Error", "from the field", "from masks"),
+        classes=("", "number", "number", "", "number", "number", "number"),
+        rows=tuple(rows),
+        data=loop.table,
+    )
+    groups = read_groups(
+        [folder / "found", folder / "truth"], names=["measured on masks", "simulation itself"]
+    )
+    figures = (
+        matched_figures.layer_figure(matched_figures.add_sources(groups)),
+        matched_figures.shape_figure(groups),
+        matched_figures.scattering_figure(groups),
+    )
+    return Section(
+        "closed-loop",
+        "Can the numbers be trusted? A closed loop",
+        text=(
+            f"A layer of {scene.cells} deformable cells was simulated (φ = {scene.phi:g}, "
+            f"v_{{0}} = {scene.v0:g}, η = {scene.eta:g}), drawn as label masks with "
+            f"{LENGTH / PIXEL:.0f} pixels per cell diameter and one frame every "
+            f"{(scene.save_every or 1) * TIME:g} min, and measured by the same program as the "
+            "recording. What it should have found is known exactly.",
+        ),
+        tables=(table,),
+        figures=tuple(figure for figure in figures if figure is not None),
+    )

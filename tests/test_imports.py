@@ -29,7 +29,8 @@ ALLOWED: dict[str, set[str]] = {
     "batch": FOUNDATION
     | {"observables", "segment", "track", "sim", "compare", "pipeline", "engines", "study"},
     "sweep": FOUNDATION | {"observables", "sim", "pipeline", "engines"},
-    "demo": FOUNDATION | {"observables", "segment", "track", "sim", "compare", "pipeline"},
+    "closed_loop": FOUNDATION | {"observables", "segment", "track", "sim", "pipeline"},
+    "demo": FOUNDATION | {"observables", "track", "sim", "compare", "pipeline", "closed_loop"},
 }
 FORBIDDEN = {"napari", "PyQt5", "PyQt6", "PySide2", "PySide6", "qtpy", "pickle", "shelve"}
 HEAVY = ("numba", "statsmodels", "matplotlib", "trackpy", "pandas", "scipy", "cv2", "zarr")

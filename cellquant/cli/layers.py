@@ -77,6 +77,41 @@ def simulate(
     note(f"wrote {output}")
 
 
+def render(
+    run: Annotated[Path, typer.Argument(help="RUN.zarr")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="TIFF of the label masks.")],
+    pixel_size: Annotated[float, typer.Option(help="Edge of a pixel in um.", metavar="UM")],
+    length: Annotated[
+        float, typer.Option(help="One L0 (mean cell diameter) in um.", metavar="UM_PER_L0")
+    ] = 10.0,
+    time: Annotated[
+        float, typer.Option(help="One t0 in min; 10 s by default.", metavar="MIN_PER_T0")
+    ] = 1.0 / 6.0,
+    phase_contrast: Annotated[
+        Path | None, typer.Option(help="TIFF of a movie that looks like phase contrast.")
+    ] = None,
+) -> None:
+    """Render a run as label masks, with its true tracks and contours in OUTPUT_truth."""
+    from cellquant.sim import open_run
+    from cellquant.sim import render as render_run
+    from cellquant.storage import check_output
+
+    check_output(output.parent)
+    with step("render") as progress:
+        done = render_run(
+            open_run(run),
+            output,
+            pixel_size=pixel_size,
+            length=length,
+            time=time,
+            phase_contrast=phase_contrast,
+            progress=progress,
+        )
+    height, width = done.shape
+    say(f"masks: {done.masks}, {width} x {height} px")
+    say(f"true tracks: {done.truth}, {done.tracks.n_tracks} tracks")
+
+
 def sweep(
     file: Annotated[Path, typer.Argument(help="sweep.toml", metavar="SWEEP.toml")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Output folder.")] = None,
@@ -112,5 +147,5 @@ def sweep(
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
-    for command in (simulate, sweep):
+    for command in (simulate, render, sweep):
         app.command()(command)
