@@ -20,13 +20,13 @@ def demo_scene(seed: int) -> SceneConfig:
     """A small layer that relaxes within the run."""
     return SceneConfig(
         cells=100,
-        phi=0.95,
-        v0=0.05,
+        phi=0.92,
+        v0=0.07,
         eta=0.01,
-        rotational_diffusion=0.05,
+        rotational_diffusion=0.02,
         transient=40,
-        duration=240,
-        save_every=4,
+        duration=200,
+        save_every=2.5,
         dt=0.02,
         seed=seed,
     )
