@@ -1,12 +1,25 @@
 """Linking: closed forms, invariances, broken input."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.optimize import linear_sum_assignment
 
 import cellquant as cq
 from cellquant.errors import InputError
-from cellquant.io import LabelStack
-from cellquant.tables import TRACK_COLUMNS
+from cellquant.io import LabelStack, read_images, read_labels
+from cellquant.tables import PIXEL, TRACK_COLUMNS, Cells
+from cellquant.track import track_cells
+from cellquant.track.assign import match, match_with_divisions
+from cellquant.track.evaluate import evaluate
+from cellquant.track.kernels import marginals
 
 
 def discs(paths: np.ndarray, *, size: int = 120, radius: float = 3.2) -> np.ndarray:
@@ -48,3 +61,265 @@ def test_single_frame_is_refused() -> None:
 def test_background_movie_is_refused() -> None:
     with pytest.raises(InputError, match="holds a cell"):
         cq.track(stack_of(np.zeros((4, 20, 20), dtype=np.int32)))
+
+
+def test_linear_crossing_keeps_identity_by_history() -> None:
+    """Two rows of cells pass through each other: only the path tells who is who."""
+    y = np.arange(20.0, 110.0, 22.0)
+    right = np.column_stack((np.full(len(y), 15.0), y))
+    left = np.column_stack((np.full(len(y), 105.0), y + 11.0))
+    times = np.arange(16)[:, None, None]
+    paths = np.concatenate(
+        (right[None] + times * [5.0, 0.0], left[None] - times * [5.0, 0.0]), axis=1
+    )
+    tracks = cq.track(stack_of(discs(paths, size=125)), divisions=False)
+    lengths = tracks.table.groupby("track_id").size()
+    assert len(lengths) == 2 * len(y)
+    assert (tracks.table.groupby("track_id")["label"].nunique() == 1).all()
+
+
+def test_single_cell_is_followed() -> None:
+    paths = np.array([[[20.0 + 2 * t, 30.0]] for t in range(6)])
+    tracks = cq.track(stack_of(discs(paths)))
+    assert tracks.n_tracks == 1
+    assert np.isnan(tracks.table["link_confidence"].iloc[0])
+    assert (tracks.table["link_confidence"].iloc[1:] > 0.5).all()
+
+
+def test_missing_cell_is_bridged_within_max_gap() -> None:
+    paths = np.repeat(lattice()[None], 12, axis=0) + 0.5 * np.arange(12)[:, None, None]
+    paths[5, 7] = paths[5:7, 12] = np.nan
+    array = discs(paths)
+    bridged = cq.track(stack_of(array))
+    assert bridged.provenance["gaps_closed"] == 2
+    assert bridged.n_tracks == 25
+    cut = cq.track(stack_of(array), max_gap=0)
+    assert cut.provenance["gaps_closed"] == 0
+    assert cut.n_tracks == 27
+
+
+def test_empty_frame_within_a_movie() -> None:
+    paths = np.repeat(lattice()[None], 9, axis=0) + np.arange(9)[:, None, None]
+    array = discs(paths)
+    array[4] = 0
+    tracks = cq.track(stack_of(array))
+    assert tracks.n_tracks == 25
+    assert set(tracks.table["frame"]) == {0, 1, 2, 3, 5, 6, 7, 8}
+    assert any("frames without cells" in text for text in tracks.provenance["warnings"])
+
+
+def test_divisions_are_found_and_can_be_switched_off() -> None:
+    rng = np.random.default_rng(2)
+    start = lattice(7, 26.0, 22.0)
+    n = len(start)
+    paths = np.full((10, n + 8, 2), np.nan)
+    mothers = rng.permutation(n)[:8]
+    for t in range(10):
+        paths[t, :n] = start + 0.3 * t
+        for k, mother in enumerate(mothers):
+            if t > k:
+                paths[t, mother] = start[mother] + [-5.0, 0.3 * t]
+                paths[t, n + k] = start[mother] + [5.0, 0.3 * t]
+    array = discs(paths, size=205, radius=4.6)
+    tracks = cq.track(stack_of(array))
+    assert tracks.provenance["divisions"] == 8
+    families = tracks.table[tracks.table["parent_track_id"] > 0].groupby("parent_track_id")
+    assert (families["track_id"].nunique() == 2).all()
+    without = cq.track(stack_of(array), divisions=False)
+    assert (without.table["parent_track_id"] == 0).all()
+
+
+def wandering(seed: int = 0, frames: int = 8) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(scale=1.2, size=(frames, 25, 2)) + np.array([1.0, 0.5])
+    return lattice()[None] + np.cumsum(steps, axis=0)
+
+
+def test_labels_carry_no_information() -> None:
+    array = discs(wandering())
+    rng = np.random.default_rng(1)
+    shuffled = np.zeros_like(array)
+    names = []
+    for frame, image in enumerate(array):
+        new = np.append(0, rng.permutation(int(image.max())) + 1)
+        shuffled[frame] = new[image]
+        names.append(np.argsort(new))
+    one = cq.track(stack_of(array)).table
+    other = cq.track(stack_of(shuffled)).table
+    back = [names[f][n] for f, n in zip(other["frame"], other["label"], strict=True)]
+    key = other.assign(label=back)
+    paths = {
+        tuple(g[["frame", "label"]].itertuples(index=False, name=None))
+        for _, g in one.groupby("track_id")
+    }
+    same = {
+        tuple(g[["frame", "label"]].itertuples(index=False, name=None))
+        for _, g in key.groupby("track_id")
+    }
+    assert paths == same
+
+
+def test_same_input_gives_equal_tables() -> None:
+    stack = stack_of(discs(wandering(3)))
+    pd.testing.assert_frame_equal(cq.track(stack).table, cq.track(stack).table, check_exact=True)
+
+
+def test_shuffled_time_is_noticed() -> None:
+    rng = np.random.default_rng(5)
+    paths = np.array([rng.random((25, 2)) * 100 + 10 for _ in range(6)])
+    tracks = cq.track(stack_of(discs(paths)))
+    assert tracks.provenance["warnings"]
+
+
+def test_raw_movie_takes_part(tmp_path: Path) -> None:
+    array = discs(wandering(4))
+    rng = np.random.default_rng(0)
+    raw = (array > 0) * 100 + rng.integers(0, 20, array.shape)
+    tifffile.imwrite(tmp_path / "raw.tif", raw.astype(np.uint16), metadata={"axes": "TYX"})
+    images = read_images(tmp_path / "raw.tif")
+    assert cq.track(stack_of(array), raw=images).n_tracks >= 25
+
+
+def test_wrong_options_are_refused() -> None:
+    stack = stack_of(discs(wandering()))
+    with pytest.raises(InputError, match="max_distance"):
+        cq.track(stack, max_distance=-1.0)
+    with pytest.raises(InputError, match="linker"):
+        cq.track(stack, linker="magic")
+    with pytest.raises(InputError, match="max_gap"):
+        cq.track(stack, max_gap=-1)
+
+
+def test_max_distance_forbids_longer_steps() -> None:
+    paths = lattice()[None] + np.arange(5)[:, None, None] * np.array([6.0, 0.0])
+    tracks = cq.track(stack_of(discs(paths)), max_distance=4.0)
+    assert tracks.provenance["links"] == 0
+
+
+def test_trackpy_baseline_follows_slow_cells() -> None:
+    tracks = cq.track(stack_of(discs(wandering(6))), linker="trackpy")
+    assert tracks.provenance["settings"]["linker"] == "trackpy"
+    assert tracks.n_tracks >= 25
+
+
+def cells_at(points: list[np.ndarray]) -> Cells:
+    """Cells at given points, all round and equal, without masks."""
+    parts = [
+        pd.DataFrame(
+            {"frame": frame, "label": np.arange(1, len(p) + 1), "x": p[:, 0], "y": p[:, 1]}
+        )
+        for frame, p in enumerate(points)
+    ]
+    table = pd.concat(parts, ignore_index=True).assign(
+        area=30.0,
+        perimeter=20.0,
+        shape_index=3.65,
+        aspect_ratio=1.0,
+        orientation=0.0,
+        touches_border=False,
+        n_neighbours=0,
+    )
+    return Cells(
+        table.astype({"frame": "int64", "label": "int64"}),
+        PIXEL,
+        1.0,
+        1.0,
+        (100.0, 100.0),
+        len(points),
+        np.full(len(points), 1e4),
+    )
+
+
+point_sets = st.lists(
+    st.integers(0, 12).flatmap(
+        lambda n: arrays(np.float64, (n, 2), elements=st.floats(0.0, 100.0, width=16))
+    ),
+    min_size=2,
+    max_size=5,
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(point_sets)
+def test_any_points_give_every_cell_one_track(points: list[np.ndarray]) -> None:
+    cells = cells_at(points)
+    if cells.table.empty:
+        with pytest.raises(InputError):
+            track_cells(cells)
+        return
+    table = track_cells(cells).table
+    assert len(table) == len(cells.table)
+    assert not table.duplicated(["frame", "label"]).any()
+    assert not table.duplicated(["track_id", "frame"]).any()
+    assert sorted(table["track_id"].unique()) == list(range(1, table["track_id"].nunique() + 1))
+    born = table.groupby("track_id")["parent_track_id"].first()
+    assert born[born > 0].value_counts().isin([2]).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(arrays(np.float64, (4, 5), elements=st.floats(-3.0, 5.0, width=16)))
+def test_match_is_optimal(gains: np.ndarray) -> None:
+    row, column = np.indices(gains.shape).reshape(2, -1)
+    chosen = match(row, column, gains.reshape(-1))
+    assert len(set(row[chosen])) == len(set(column[chosen])) == len(chosen)
+    clipped = np.maximum(gains, 0.0)
+    oracle = clipped[linear_sum_assignment(-clipped)].sum()
+    assert gains.reshape(-1)[chosen].sum() == pytest.approx(oracle)
+
+
+def test_match_with_divisions_prefers_the_better_explanation() -> None:
+    rows, columns = np.array([0, 1]), np.array([10, 11])
+    family = np.array([[0, 10, 11]])
+    links, split = match_with_divisions(
+        rows, columns, np.array([2.0, 1.0]), family, np.array([5.0])
+    )
+    assert len(links) == 0
+    assert split.tolist() == [0]
+    links, split = match_with_divisions(
+        rows, columns, np.array([3.0, 3.0]), family, np.array([5.0])
+    )
+    assert links.tolist() == [0, 1]
+    assert len(split) == 0
+
+
+def test_marginals_of_one_pair_are_its_odds() -> None:
+    out = np.empty((1, 1))
+    marginals(np.array([[1.5]]), np.array([[0]]), 1, 6, out)
+    assert out[0, 0] == pytest.approx(1.0 / (1.0 + np.exp(-1.5)))
+
+
+@pytest.mark.slow
+def test_twenty_thousand_cells_per_frame_stay_bounded() -> None:
+    rng = np.random.default_rng(0)
+    side = np.sqrt(20_000.0) * 10
+    start = rng.random((20_000, 2)) * side
+    points = [
+        start,
+        start + rng.normal(scale=2.0, size=start.shape),
+        rng.random((20_000, 2)) * side,
+    ]
+    cells = cells_at(points)
+    cells = replace(cells, field_of_view=(side, side))
+    assert track_cells(cells).provenance["links"] > 18_000
+
+
+@pytest.mark.parametrize(
+    ("name", "edge", "division", "idf1"),
+    [("epidermis_area1", 0.95, 0.75, 0.86), ("cell_migration", 0.9997, 0.93, 0.994)],
+)
+def test_real_recordings_with_shuffled_labels(
+    recordings: Path, name: str, edge: float, division: float, idf1: float
+) -> None:
+    stack = read_labels(recordings / name / "TRA", units="pixel")
+    rng = np.random.default_rng(11)
+    shuffled = []
+    for image in stack:
+        labels = np.unique(image)
+        new = np.zeros(int(image.max()) + 1, dtype=np.int32)
+        new[labels[labels > 0]] = rng.permutation(int((labels > 0).sum())) + 1
+        shuffled.append(new[image])
+    tracks = cq.track(LabelStack.from_array(np.stack(shuffled), units="pixel"))
+    scores = evaluate(tracks, recordings / name)
+    assert scores.edge_f1 >= edge
+    assert scores.division_f1 >= division
+    assert scores.idf1 >= idf1

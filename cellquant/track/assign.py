@@ -29,8 +29,16 @@ def match(rows: IntArray, columns: IntArray, gains: FloatArray) -> IntArray:
     useful = np.flatnonzero(gains > 0.0)
     if useful.size == 0:
         return useful
-    row_of, row = np.unique(rows[useful], return_inverse=True)
-    column_of, column = np.unique(columns[useful], return_inverse=True)
+    row_of, row, in_row = np.unique(rows[useful], return_inverse=True, return_counts=True)
+    column_of, column, in_column = np.unique(
+        columns[useful], return_inverse=True, return_counts=True
+    )
+    # Most pairs have no rival: only the others need an assignment.
+    alone = (in_row[row] == 1) & (in_column[column] == 1)
+    if alone.any():
+        rest = useful[~alone]
+        others = rest[match(rows[rest], columns[rest], gains[rest])]
+        return np.sort(np.concatenate((useful[alone], others)))
     n, m = len(row_of), len(column_of)
     # Every row also has a column of its own that means "no partner". Its cost is the same in all
     # rows and above every gain, so that no stored entry is zero (zeros would be dropped).

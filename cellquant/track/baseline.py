@@ -1,5 +1,6 @@
 """The plain baseline: trackpy's nearest-neighbour linking of centroids."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,13 @@ def trackpy_links(
         {"x": movie.position[:, 0], "y": movie.position[:, 1], "frame": movie.frame}
     )
     table["cell"] = np.arange(movie.n_cells)
-    linked = trackpy.link(
-        table, reach, memory=max_gap, adaptive_stop=0.1 * reach, adaptive_step=0.9
-    )
+    with warnings.catch_warnings():
+        # trackpy's use of pandas is not for our users to mend.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", FutureWarning)
+        linked = trackpy.link(
+            table, reach, memory=max_gap, adaptive_stop=0.1 * reach, adaptive_step=0.9
+        )
     linked = linked.sort_values(["particle", "frame", "cell"], kind="stable")
     cell, particle = linked["cell"].to_numpy(np.int64), linked["particle"].to_numpy()
     after = np.full(movie.n_cells, -1, dtype=np.int64)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cellquant.track.kernels import neighbour_mean, pair_gains
 from cellquant.track.movie import LOG_AREA, NEAR, BoolArray, FloatArray, IntArray, Movie
@@ -89,8 +90,11 @@ class Rates:
     counts: dict[str, int] = field(default_factory=dict)
 
 
-def paths(movie: Movie, links: Links | None, flow: FloatArray) -> Paths:
-    """Collect displacements from links, or from the flow where there are none yet."""
+def paths(movie: Movie, links: Links | None, flow: FloatArray, carried: FloatArray) -> Paths:
+    """Collect displacements from links, or from the flow where there are none yet.
+
+    carried (N, 2) is the flow of the frame before, at the cells that it reaches.
+    """
     n = movie.n_cells
     frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
     elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
@@ -116,32 +120,32 @@ def paths(movie: Movie, links: Links | None, flow: FloatArray) -> Paths:
         source = moved[here][used] if used.sum() >= 3 else per_frame[here]
         drift[index] = np.median(source, axis=0)
     relative = moved - drift[frames]
+    before_drift = np.vstack((np.zeros(2), drift[:-1]))[frames]
     fallback = per_frame - drift[frames]
     fallback[movie.start[-2] :] = 0.0
     around_after = np.empty((n, 2, 2))
     neighbour_mean(relative, weight, movie.neighbours, NEAR, fallback, 0.5, around_after)
     around_before = np.zeros((n, 2, 2))
     if links is None:
-        around_before = _carried(movie, flow, fallback)
+        around_before = np.repeat((carried - before_drift)[:, None], 2, axis=1)
     else:
         own_after[single] = relative[single]
         own_before[target] = relative[single]
         arrived = np.zeros(n)
         arrived[target] = weight[single]
-        carried = _carried(movie, flow, fallback)[:, 0]
-        neighbour_mean(own_before, arrived, movie.neighbours, NEAR, carried, 0.5, around_before)
+        neighbour_mean(
+            own_before, arrived, movie.neighbours, NEAR, carried - before_drift, 0.5, around_before
+        )
     return Paths(drift, own_after, own_before, has_after, has_before, around_after, around_before)
 
 
-def _carried(movie: Movie, flow: FloatArray, fallback: FloatArray) -> FloatArray:
-    """Flow of the frame before, (N, 2, 2), at the cells that it brings nearest."""
-    from scipy.spatial import cKDTree
-
-    carried = np.zeros((movie.n_cells, 2, 2))
+def carried_flow(movie: Movie, flow: FloatArray) -> FloatArray:
+    """Flow per frame of the frame before, (N, 2), at the cells that it brings nearest."""
+    carried = np.zeros((movie.n_cells, 2))
     for index in range(len(movie.time) - 1):
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
         _, nearest = cKDTree(movie.position[a] + flow[a]).query(movie.position[b])
-        carried[b] = fallback[a][nearest][:, None]
+        carried[b] = flow[a][nearest] / (movie.time[index + 1] - movie.time[index])
     return carried
 
 

@@ -12,6 +12,8 @@ _WIDTHS = (0.6, 0.2)  # of the soft assignment, first and last, in units of the 
 _STEPS = 12
 _OUTLIER = 0.1
 _VOTERS = 2000
+_ENOUGH_MATCHED = 0.75
+_FLOW_CANDIDATES = 8
 
 
 def common_shift(here: FloatArray, there: FloatArray, spacing: float) -> FloatArray:
@@ -61,29 +63,29 @@ def pair_flow(movie: Movie, index: int, previous: FloatArray | None) -> FloatArr
     previous
         (n, 2) displacement expected from the frames before; None where there are none.
 
-    Starts from the most frequent displacement, and also from `previous`, and keeps the start
-    that finds a partner for more cells.
+    Starts from `previous`, and also from the most frequent displacement where that start leaves
+    many cells without a partner; keeps the start that finds more.
     """
     a, b = movie.cells_of(index), movie.cells_of(index + 1)
     here, there = movie.position[a], movie.position[b]
     spacing = min(movie.spacing[index], movie.spacing[index + 1])
-    shift = common_shift(here, there, spacing)
-    starts = [np.tile(shift, (len(here), 1))]
-    if previous is not None:
-        starts.append(previous)
     neighbours = movie.neighbours[a, :8] - movie.start[index]
     widths = spacing * np.geomspace(*_WIDTHS, _STEPS)
     rounds = np.maximum(1, np.linspace(3, 0, _STEPS).round()).astype(np.int64)
-    best: FloatArray | None = None
-    best_matched = -1.0
-    for start in starts:
-        candidates = nearest_cells(here + start, there, min(CANDIDATES, len(there)))
+
+    def follow(start: FloatArray) -> tuple[FloatArray, float]:
+        candidates = nearest_cells(here + start, there, min(_FLOW_CANDIDATES, len(there)))
         flow = start.copy()
         matched = soft_flow(here, there, candidates, neighbours, flow, widths, rounds, _OUTLIER)
-        if matched > best_matched + 1e-9:
-            best, best_matched = flow, matched
-    assert best is not None
-    return best
+        return flow, matched
+
+    flow, matched = (np.zeros((0, 2)), -1.0) if previous is None else follow(previous)
+    if matched < _ENOUGH_MATCHED:
+        shift = common_shift(here, there, spacing)
+        other, other_matched = follow(np.tile(shift, (len(here), 1)))
+        if other_matched > matched + 1e-9:
+            flow = other
+    return flow
 
 
 def all_flows(movie: Movie, *, local: bool = True) -> FloatArray:

@@ -221,8 +221,10 @@ def pair_gains(
             nu = tail[kind]
             distance = (rx * rx + ry * ry) * elapsed[i] * elapsed[i] / (width * width * nu)
             value = -np.log(2 * np.pi * width * width) - (nu / 2 + 1) * np.log1p(distance)
-            if cut[i] or cut[j]:
-                gain[i, c] = value + stay[i] - leave[i] - appear[j]
+            value += stay[i] - leave[i] - appear[j]
+            # No shape makes up for such a step.
+            if cut[i] or cut[j] or value < -30.0:
+                gain[i, c] = value
                 continue
             near = 0.0
             far = 0.0
@@ -239,7 +241,7 @@ def pair_gains(
             half = (shape_tail + f) / 2
             value += shape_constant
             value -= half * (np.log1p(near / shape_tail) - np.log1p(far / shape_tail))
-            gain[i, c] = value + stay[i] - leave[i] - appear[j]
+            gain[i, c] = value
 
 
 @njit(cache=True)

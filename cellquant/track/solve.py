@@ -14,6 +14,7 @@ from cellquant.track.costs import (
     Paths,
     Rates,
     Shapes,
+    carried_flow,
     expected_steps,
     fates,
     first_motion,
@@ -62,6 +63,7 @@ class Solution:
 
     movie: Movie
     flow: FloatArray
+    carried: FloatArray
     candidates: IntArray
     leaving: BoolArray
     entering: BoolArray
@@ -149,6 +151,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         found = nearest_cells(movie.position[a] + flow[a], movie.position[b])
         candidates[a] = np.where(found >= 0, found + movie.start[index + 1], -1)
     leaving, entering = near_edge(movie, flow)
+    carried = carried_flow(movie, flow)
     none = np.empty(0, dtype=np.int64)
     return Solution(
         movie=movie,
@@ -156,15 +159,22 @@ def _start(movie: Movie, options: Options) -> Solution:
         candidates=candidates,
         leaving=leaving,
         entering=entering,
-        known=_paths(movie, None, flow, options),
+        carried=carried,
+        known=_paths(movie, None, flow, carried, options),
         motion=first_motion(float(np.median(movie.spacing))),
         shapes=fit_shapes(movie, none, none, np.empty(0)),
         rates=fit_rates(movie, None, leaving, entering),
     )
 
 
-def _paths(movie: Movie, links: Links | None, flow: FloatArray, options: Options) -> Paths:
-    known = paths(movie, links, flow)
+def _paths(
+    movie: Movie,
+    links: Links | None,
+    flow: FloatArray,
+    carried: FloatArray,
+    options: Options,
+) -> Paths:
+    known = paths(movie, links, flow, carried)
     if not options.use_path:
         nobody = np.zeros_like(known.has_after)
         known = replace(known, has_after=nobody, has_before=nobody)
@@ -177,7 +187,7 @@ def _paths(movie: Movie, links: Links | None, flow: FloatArray, options: Options
 def _refit(state: Solution, options: Options, turn: int) -> None:
     movie, links = state.movie, state.links
     assert links is not None
-    state.known = _paths(movie, links, state.flow, options)
+    state.known = _paths(movie, links, state.flow, state.carried, options)
     state.motion = fit_motion(movie, links, state.known, state.motion)
     single = np.flatnonzero((links.after >= 0) & (links.second < 0))
     target = links.after[single]
