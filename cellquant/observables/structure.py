@@ -183,12 +183,13 @@ def _shells(q: FloatArray, power: FloatArray, width: float, scale: float) -> Str
     table = pd.DataFrame(
         {"wave_number": mean_q, "value": value, "std_error": error, "n_vectors": n.astype(np.int64)}
     )
-    return StructureFactor(table, _first_peak(mean_q, value, sums, counts, scale))
+    return StructureFactor(table, _first_peak(mean_q, value, error, sums, counts, scale))
 
 
 def _first_peak(
     q: FloatArray,
     value: FloatArray,
+    error: FloatArray,
     sums: FloatArray,
     counts: FloatArray,
     scale: float,
@@ -201,8 +202,10 @@ def _first_peak(
     k = int(np.flatnonzero(window)[np.argmax(value[window])])
     if k in (np.flatnonzero(window)[0], np.flatnonzero(window)[-1]):
         return {**none, "reason": "S(q) has no maximum between 0.6 and 1.6 times 2 pi/d"}
-    # |sum exp(-i q r)|^2/N of independent points is exponential with mean and spread 1.
-    if not value[k] - 1 > 4 / np.sqrt(counts[:, k].sum()):
+    # |sum exp(-i q r)|^2/N of independent points is exponential with mean and spread 1; of a
+    # crystal it differs so much between the vectors of a shell that only this bound is of use.
+    scatter = 1 / np.sqrt(counts[:, k].sum())
+    if not value[k] - 1 > 4 * np.fmin(error[k], scatter):
         reason = "the maximum of S(q) is within the scatter of independent positions"
         return {**none, "reason": reason}
     near = np.abs(q - q[k]) <= max(0.12 * q[k], 1.01 * (q[k + 1] - q[k]), 1.01 * (q[k] - q[k - 1]))

@@ -63,6 +63,10 @@ class MixedModel:
         return {k: v for k, v in asdict(self).items() if k != "reason" or v is not None}
 
 
+# Random effects this many times the residual leave nothing of X'V^-1 X in double precision.
+_LARGEST = 1e5
+
+
 class _Reml:
     """Profiled restricted likelihood in the three entries of the relative Cholesky factor.
 
@@ -73,39 +77,46 @@ class _Reml:
 
     def __init__(self, z: FloatArray, y: FloatArray, group: Any, n_groups: int) -> None:
         self.n = y.size
-        self.cross = np.zeros((n_groups, 2, 2))
-        self.own = np.zeros((n_groups, 2))
+        self.cross = np.zeros((3, n_groups))  # n, sum z, sum z^2 of each trial
+        self.own = np.zeros((2, n_groups))
         self.within = 0.0
         for g in range(n_groups):
             design = np.column_stack([np.ones(np.sum(group == g)), z[group == g]])
             target = y[group == g]
-            self.cross[g] = design.T @ design
-            self.own[g] = np.linalg.lstsq(design, target, rcond=None)[0]
-            self.within += float(np.sum((target - design @ self.own[g]) ** 2))
+            self.cross[:, g] = design[:, 0].sum(), design[:, 1].sum(), np.sum(design[:, 1] ** 2)
+            self.own[:, g] = np.linalg.lstsq(design, target, rcond=None)[0]
+            self.within += float(np.sum((target - design @ self.own[:, g]) ** 2))
 
     def solve(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
         """Sum of log|V_g|, X'V^-1 X, the fixed effects and the weighted residual sum."""
-        factor = np.array([[theta[0], 0.0], [theta[1], theta[2]]])
-        half = self.cross @ factor
-        middle = np.eye(2) + factor.T @ half
-        log_det = float(np.sum(np.log(np.linalg.det(middle))))
-        weight = self.cross - half @ np.linalg.solve(middle, half.transpose(0, 2, 1))
-        information = weight.sum(axis=0)
-        beta = np.linalg.solve(information, np.einsum("gij,gj->i", weight, self.own))
-        off = self.own - beta
-        residual = self.within + float(np.einsum("gi,gij,gj->", off, weight, off))
-        return log_det, information, beta, residual
+        a, b, c = (float(v) for v in theta)
+        s0, s1, s2 = self.cross
+        # With L = [[a, 0], [b, c]]: S L = [[p, q], [r, t]] and I + L'S L = [[k, n], [n, m]].
+        p, q, r, t = s0 * a + s1 * b, s1 * c, s1 * a + s2 * b, s2 * c
+        k, n, m = 1 + a * p + b * r, c * r, 1 + c * t
+        det = k * m - n * n
+        w0 = s0 - (p * p * m - 2 * p * q * n + q * q * k) / det
+        w1 = s1 - (p * r * m - (p * t + q * r) * n + q * t * k) / det
+        w2 = s2 - (r * r * m - 2 * r * t * n + t * t * k) / det
+        b0, b1 = self.own
+        i0, i1, i2 = float(w0.sum()), float(w1.sum()), float(w2.sum())
+        h0, h1 = float((w0 * b0 + w1 * b1).sum()), float((w1 * b0 + w2 * b1).sum())
+        volume = i0 * i2 - i1 * i1
+        beta = np.array([i2 * h0 - i1 * h1, i0 * h1 - i1 * h0]) / volume
+        d0, d1 = b0 - beta[0], b1 - beta[1]
+        residual = self.within + float((w0 * d0 * d0 + 2 * w1 * d0 * d1 + w2 * d1 * d1).sum())
+        information = np.array([[i0, i1], [i1, i2]])
+        return float(np.log(det).sum()), information, beta, residual
 
     def criterion(self, theta: FloatArray) -> float:
         """Minus twice the restricted log-likelihood, profiled over beta and sigma."""
+        if np.abs(theta).max() > _LARGEST:
+            return 1e12
         log_det, information, _, residual = self.solve(theta)
         free = self.n - 2
-        volume = float(np.linalg.det(information))
-        if not volume > 0:  # random effects so large that nothing is left in double precision
-            return 1e12
         return float(
             log_det
-            + np.log(volume)
+            + np.log(np.linalg.det(information))
             + free * (1 + np.log(2 * np.pi * max(residual, 1e-300) / free))
         )
 
@@ -126,29 +137,36 @@ class _Reml:
         return float(parameters[3] ** 2 * np.linalg.inv(information)[1, 1])
 
 
-_STARTS = [
-    (1.0, 0.0, 1.0), (0.1, 0.0, 0.1), (3.0, 0.0, 3.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0),
-    (0.5, 0.5, 0.1), (0.5, -0.5, 0.1), (0.05, 0.0, 0.0), (5.0, 2.0, 0.5), (5.0, -2.0, 0.5),
-]  # fmt: skip
+_SCALES = (0.0, 0.1, 0.4, 1.5, 6.0)
+_TILTS = (-3.0, -0.5, 0.0, 0.5, 3.0)
+
+
+def _descend(model: _Reml, start: FloatArray, free: list[int]) -> FloatArray:
+    """Nelder-Mead descent in some of the entries; a gradient would not pay at this size."""
+
+    def restricted(values: FloatArray) -> float:
+        point = start.copy()
+        point[free] = values
+        return model.criterion(point)
+
+    spread = np.maximum(0.2 * np.abs(start[free]), 0.05)
+    options = {
+        "xatol": 1e-9, "fatol": 1e-11, "maxiter": 3000, "maxfev": 3000,
+        "initial_simplex": np.vstack([start[free], start[free] + np.diag(spread)]),
+    }  # fmt: skip
+    found = optimize.minimize(restricted, start[free], method="Nelder-Mead", options=options)
+    point = start.copy()
+    point[free] = found.x
+    return point
 
 
 def _best_theta(model: _Reml) -> FloatArray:
-    """Global minimum of the criterion: many starts, a polish, and every corner of the boundary."""
-    bounds = [(0, None), (None, None), (0, None)]
-    found = [
-        optimize.minimize(model.criterion, start, method="L-BFGS-B", bounds=bounds)
-        for start in _STARTS
-    ]
-    best = min(found, key=lambda result: float(result.fun)).x
+    """Global minimum of the criterion: a grid, descents from its best places, and the boundary."""
+    grid = [np.array([a, b, c]) for a in _SCALES for b in _TILTS for c in _SCALES]
+    grid.sort(key=model.criterion)
+    found = [_descend(model, start, [0, 1, 2]) for start in grid[:5]]
+    best = _descend(model, min(found, key=model.criterion), [0, 1, 2])
     # The criterion depends on the signs of the diagonal only through its square.
-    for _ in range(2):
-        polish = optimize.minimize(
-            model.criterion,
-            best,
-            method="Nelder-Mead",
-            options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 4000, "maxfev": 4000},
-        )
-        best = polish.x if polish.fun <= model.criterion(best) else best
     theta = np.array([abs(best[0]), best[1] * (np.sign(best[0]) or 1.0), abs(best[2])])
     lowest = model.criterion(theta)
     near = {1, *(k for k in (0, 2) if theta[k] < 0.1)}
@@ -159,27 +177,10 @@ def _best_theta(model: _Reml) -> FloatArray:
         corner[list(fixed)] = 0.0
         free = [k for k in range(3) if k not in fixed]
         if free:
-            corner = _refine_corner(model, corner, free)
+            corner = _descend(model, corner, free)
         if model.criterion(corner) <= lowest + 1e-9:
             return corner
     return theta
-
-
-def _refine_corner(model: _Reml, corner: FloatArray, free: list[int]) -> FloatArray:
-    def restricted(values: FloatArray) -> float:
-        point = corner.copy()
-        point[free] = values
-        return model.criterion(point)
-
-    result = optimize.minimize(
-        restricted,
-        corner[free],
-        method="Nelder-Mead",
-        options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 2000, "maxfev": 2000},
-    )
-    point = corner.copy()
-    point[free] = result.x
-    return point
 
 
 def _satterthwaite(model: _Reml, parameters: FloatArray) -> float:
@@ -215,9 +216,9 @@ def fit_mixed_model(x: Any, y: Any, group: Any) -> MixedModel:
 
     ``y = (b0 + u0_g) + (b1 + u1_g) x + e`` with ``(u0, u1)`` normal with any covariance and
     independent normal e, fitted by restricted maximum likelihood. The predictor is standardised
-    first, the likelihood profiled over fixed effects and scale, and minimised from ten starts
-    with a derivative-free polish; solutions on the boundary are tried explicitly. P and interval
-    of the slope use t with Satterthwaite's degrees of freedom.
+    first, the likelihood profiled over fixed effects and scale, and minimised without
+    derivatives from the five best places of a grid; solutions on the boundary are tried
+    explicitly. P and interval of the slope use t with Satterthwaite's degrees of freedom.
 
     Parameters
     ----------
