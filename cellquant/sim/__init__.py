@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 _HOMES = {
     "Scene": "scene",
     "SimulationFailure": "scene",
-    "Run": "run",
+    "Run": "archive",
     "open_run": "run",
     "simulate": "run",
     "render": "rendering",
@@ -16,7 +16,7 @@ _HOMES = {
 __all__ = sorted(_HOMES)
 
 if TYPE_CHECKING:
-    from cellquant.sim.run import Run as Run
+    from cellquant.sim.archive import Run as Run
     from cellquant.sim.run import open_run as open_run
     from cellquant.sim.run import simulate as simulate
     from cellquant.sim.scene import Scene as Scene

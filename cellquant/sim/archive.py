@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -23,7 +23,7 @@ CHECKPOINT = "checkpoint.npz"
 CHUNK = 262_144  # numbers of a chunk: what one write of a growing run touches
 
 
-def create_group(path: Path | None, scene: Scene, settings: dict[str, Any]) -> zarr.Group:
+def create_group(path: Path | None, scene: Scene, settings: dict[str, Any]) -> Any:
     """Make an empty run on disk, or in memory where the path is None."""
     store = zarr.storage.MemoryStore() if path is None else zarr.storage.LocalStore(path)
     group = zarr.create_group(store, zarr_format=3)
@@ -57,13 +57,13 @@ def create_group(path: Path | None, scene: Scene, settings: dict[str, Any]) -> z
     return group
 
 
-def write_constants(group: zarr.Group, radius: Floats, box: Floats) -> None:
+def write_constants(group: Any, radius: Floats, box: Floats) -> None:
     """Store what does not change with time."""
     for name, values in (("radius", radius), ("box", box)):
         group.create_array(name, shape=values.shape, dtype="float64")[:] = values
 
 
-def open_group(path: Path, mode: str = "r") -> zarr.Group:
+def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> Any:
     """Open the group of a run; `InputError` where the folder is none."""
     try:
         group = zarr.open_group(zarr.storage.LocalStore(path, read_only=mode == "r"), mode=mode)
@@ -81,7 +81,7 @@ def open_group(path: Path, mode: str = "r") -> zarr.Group:
     return group
 
 
-def append_frames(group: zarr.Group, start: int, times: Floats, states: Floats) -> None:
+def append_frames(group: Any, start: int, times: Floats, states: Floats) -> None:
     """Write frames from index `start` on; what stood there, after a kill, is overwritten."""
     stop = start + len(times)
     n_modes = (states.shape[2] - 3) // 2
@@ -143,8 +143,8 @@ class Run:
         Where the run is stored, None in memory.
     """
 
-    def __init__(self, group: zarr.Group, path: Path | None = None) -> None:
-        self._group = group
+    def __init__(self, group: Any, path: Path | None = None) -> None:
+        self._group: Any = group
         self.path = path
 
     @cached_property
