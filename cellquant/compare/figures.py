@@ -189,7 +189,11 @@ def draw_map(
                         (column - 0.49, row - 0.48), 0.98, 0.96, facecolor=shade, linewidth=0
                     )
                 )
-                luminance = float(np.dot(shade[:3], (0.299, 0.587, 0.114)))
+                channel = np.array(shade[:3])
+                linear = np.where(
+                    channel <= 0.04045, channel / 12.92, ((channel + 0.055) / 1.055) ** 2.4
+                )
+                luminance = float(linear @ (0.2126, 0.7152, 0.0722))
                 text = format_value(float(value), float(errors[row, column]))
                 axes.text(
                     column,
@@ -198,7 +202,7 @@ def draw_map(
                     ha="center",
                     va="center",
                     fontsize=9,
-                    color="#000000" if luminance > 0.52 else "#ffffff",
+                    color="#000000" if luminance > 0.179 else "#ffffff",
                 )
         axes.set_xlim(-0.5, columns - 0.5)
         axes.set_ylim(-0.5, rows - 0.5)

@@ -297,12 +297,15 @@ def _gaussian_process(x: FloatArray, y: FloatArray, error: FloatArray, seed: int
 
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
     spread = float(y.std()) or 1.0
-    kernel = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(
-        np.full(x.shape[1], 1.0), (0.15, 20.0)
-    ) + ConstantKernel(1.0, (1e-3, 1e3)) * DotProduct(1.0, (1e-2, 1e2))
+    smooth = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.full(x.shape[1], 1.0), (0.15, 20.0))
+    trend = ConstantKernel(1.0, (1e-3, 1e3)) * DotProduct(1.0, (1e-2, 1e2))
+    # Runs scatter more than the error estimated inside each: the white part, which the process
+    # also predicts for the run that it is asked about.
+    scatter = WhiteKernel(1e-3, (1e-7, 1.0))
+    kernel = smooth + trend + scatter
     model = GaussianProcessRegressor(
         kernel,
         alpha=(error / spread) ** 2 + 1e-6,

@@ -93,7 +93,7 @@ def canvas(*, width: float = 4.8, height: float = 3.4) -> Iterator[tuple["Figure
     }
     with mpl.rc_context(style):
         figure = Figure(figsize=(width, height))
-        left, right, bottom, top = 0.68, 0.12, 0.56, 0.36
+        left, right, bottom, top = 0.68, 0.2, 0.56, 0.36
         axes = figure.add_axes(
             (
                 left / width,
