@@ -232,7 +232,10 @@ class Context:
         from cellquant.observables.trajectories import from_tracks, log_lags
 
         paths, lags = self.paths, self.lags
-        if window is not None:
+        if window is not None and (window.start, window.stop) == self.frame_range:
+            if q == self.wave_number["q"]:
+                return self.whole_scattering
+        elif window is not None:
             paths = from_tracks(self.smoothed, frames=(window.start, window.stop))
             lags = log_lags(paths.max_lag)
         return scattering_average(

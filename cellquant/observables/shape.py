@@ -95,12 +95,17 @@ def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distri
     bandwidth = _bandwidth(values)
     grid, counts = _fine_counts(parts, bandwidth)
     smooth = _smooth(counts.sum(axis=0), grid, bandwidth)
-    whole = _descriptors(values, _peak(grid, smooth))
+    centre = float(values.mean())
+    powers = np.array([[np.sum((p - centre) ** k) for k in range(4)] for p in parts])
+    whole = _descriptors(powers.sum(axis=0), centre, float(np.median(values)), _peak(grid, smooth))
     summary: dict[str, Any] = dict(whole)
     if len(parts) >= 2:
+        medians = _medians_without(parts)
         rest = [
             _descriptors(
-                np.concatenate([p for j, p in enumerate(parts) if j != b]),
+                powers.sum(axis=0) - powers[b],
+                centre,
+                medians[b],
                 _peak(grid, _smooth(counts.sum(axis=0) - counts[b], grid, bandwidth)),
             )
             for b in range(len(parts))
@@ -143,18 +148,39 @@ def _bandwidth(values: FloatArray) -> float:
     return float(0.9 * robust * values.size ** (-0.2))
 
 
-def _descriptors(values: FloatArray, mode: float) -> dict[str, float]:
-    mean = float(values.mean())
-    centred = values - mean
-    m2, m3 = float(np.mean(centred**2)), float(np.mean(centred**3))
-    n = values.size
+def _descriptors(powers: FloatArray, centre: float, median: float, mode: float) -> dict[str, float]:
+    """Descriptors from the sums of the powers 0 to 3 of the values minus a centre."""
+    n = float(powers[0])
+    shift, second, third = (float(v) / n for v in powers[1:])
+    m2 = max(second - shift**2, 0.0)
+    m3 = third - 3 * shift * second + 2 * shift**3
+    mean = centre + shift
     return {
         "mean": mean,
-        "median": float(np.median(values)),
+        "median": median,
         "mode": mode,
         "std": float(np.sqrt(m2 * n / (n - 1))) if n > 1 else float("nan"),
         "skewness": m3 / m2**1.5 if m2 > 1e-24 * max(mean**2, 1e-300) else float("nan"),
     }
+
+
+def _medians_without(parts: list[FloatArray]) -> list[float]:
+    """Median of all values without each part, from one common sort."""
+    values = np.concatenate(parts)
+    part = np.repeat(np.arange(len(parts)), [p.size for p in parts])
+    order = np.argsort(values, kind="stable")
+    values, part = values[order], part[order]
+    medians = []
+    for b, left_out in enumerate(parts):
+        kept = np.flatnonzero(part != b)
+        half = (values.size - left_out.size) // 2
+        odd = (values.size - left_out.size) % 2 == 1
+        medians.append(
+            float(
+                values[kept[half]] if odd else 0.5 * (values[kept[half - 1]] + values[kept[half]])
+            )
+        )
+    return medians
 
 
 def _fine_counts(parts: list[FloatArray], bandwidth: float) -> tuple[FloatArray, FloatArray]:
