@@ -10,7 +10,7 @@ from cellquant.track.movie import LOG_AREA, NEAR, BoolArray, FloatArray, IntArra
 
 KINDS = 4  # no path, path after, path before, path on both sides
 TERMS = 7
-_TAILS = (2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
+_TAILS = (4.0, 6.0, 8.0, 12.0)  # heavier ones would make room for wrong links
 _SHAPE_TAIL = 5.0
 _SHAPE_FLOOR = 0.05
 _PRIOR_LINKS = 10.0
