@@ -93,9 +93,9 @@ def test_forces_are_the_gradient_of_the_clipped_polygon_energy(n_cells, eta):
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.integers(0, 10**6), st.floats(0.7, 1.1), st.floats(0.0, 0.04), st.sampled_from([2, 3, 6]))
-def test_forces_are_the_gradient_of_the_energy_and_balance(seed, phi, spread, modes):
-    scene = Scene(n_cells=12, phi=phi, modes=modes, seed=seed, **{**FREE, "eta": 0.02})
+@given(st.integers(0, 10**6), st.floats(0.7, 1.1), st.floats(0.0, 0.04))
+def test_forces_are_the_gradient_of_the_energy_and_balance(seed, phi, spread):
+    scene = Scene(n_cells=12, phi=phi, seed=seed, **{**FREE, "eta": 0.02})
     state, radius, box = lively(scene, spread, seed)
     layer = Layer(scene, radius, box)
     force = velocity(layer, state)

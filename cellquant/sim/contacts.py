@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cellquant.errors import InputError
-from cellquant.sim import kernels
+from cellquant.sim import kernels, stiffness
 from cellquant.sim.scene import Scene, SimulationFailure
 
 Floats = NDArray[np.float64]
@@ -76,13 +76,12 @@ class Layer:
             [scene.v0, scene.k, scene.eta, scene.mu_r, scene.mu_theta, scene.mu_ab], np.float64
         )
         size = exact_samples(scene.modes) if contact == "exact" else points
-        angle = 2.0 * math.pi * np.arange(size + kernels.PAD) / size
+        angle = 2.0 * math.pi * np.arange(size) / size
         rows = [f(n * angle) for n in range(1, max(scene.modes, 1) + 1) for f in (np.cos, np.sin)]
-        self._padded_table = np.ascontiguousarray(rows)
-        self._table = np.ascontiguousarray(self._padded_table[:, :size])
+        self._table = np.ascontiguousarray(rows)
         self._record = np.zeros((n_cells, kernels.HEAD + 2 * n_modes))
-        self._rho = np.zeros((n_cells, size + kernels.PAD))
-        self._slope = np.zeros((n_cells, size + kernels.PAD))
+        self._rho = np.zeros((n_cells, size))
+        self._slope = np.zeros((n_cells, size))
         self._tangent = np.zeros((n_cells, 2 + 2 * n_modes))
         self._lowest = self.radius.copy()
         self._energy = np.zeros(n_cells)
@@ -145,7 +144,7 @@ class Layer:
                 self._lowest,
                 self._rho,
                 self._slope,
-                self._padded_table,
+                self._table,
                 *common,
                 *back,
                 self._numbers,
@@ -171,6 +170,29 @@ class Layer:
             return pairs[(self._root_last > self._root_first) | (self._inside > 0)]
         apart = state[pairs[:, 1], :2] + self._shift - state[pairs[:, 0], :2]
         return pairs[np.hypot(*apart.T) < self.radius[pairs].sum(axis=1)]
+
+    def gather_stiffness(
+        self, state: Floats, scale: Floats, weight: Any, factor: Any, turning: Any, cells: Any
+    ) -> int:
+        """Collect the stiff directions of the last state evaluated; see `stiffness.gather`."""
+        return int(
+            stiffness.gather(
+                state,
+                self.radius,
+                self._record,
+                self._first,
+                self._other,
+                self._root_first,
+                self._root_last,
+                self._roots,
+                scale,
+                self.scene.k,
+                weight,
+                factor,
+                turning,
+                cells,
+            )
+        )
 
     def age_of_list(self) -> Floats:
         """Centres and reach (N, 3) for which the neighbour list was made."""
@@ -252,7 +274,6 @@ class Layer:
     def _allocate_roots(self, room: int) -> None:
         size = self._n_blocks * room
         self._roots = np.zeros((size, kernels.ROOT))
-        self._root_pair = np.zeros(size, np.int64)
         self._sign = np.zeros(size)
 
     def _find_crossings(self) -> None:
@@ -263,13 +284,12 @@ class Layer:
                 self._lowest,
                 self._rho,
                 self._slope,
-                self._padded_table,
+                self._table,
                 self._first,
                 self._other,
                 self._shift,
                 self._modes,
                 self._roots,
-                self._root_pair,
                 self._root_first,
                 self._root_last,
                 self._sign,

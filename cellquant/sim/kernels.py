@@ -25,7 +25,8 @@ FLAGS = {"contract", "nsz", "arcp"}
 REDUCE = {"contract", "nsz", "arcp", "reassoc"}
 BLOCK = 32  # cells whose contacts are searched together
 LANES = 8  # samples evaluated together
-PAD = 8  # samples repeated at the end of a contour row
+CHUNK = 64  # crossings polished together
+ROW = np.uint64(CHUNK)  # unsigned, as every index of a vector loop: a sign would need a branch
 HEAD = 4  # entries of a record before the modes
 ROOT = 6  # entries of a root: unit vector on i, unit vector on j, rho on i, rho on j
 HULL_MARGIN = 1e-4  # of the cubic through two samples, relative to A0
@@ -199,9 +200,6 @@ def contours(
                 rho[i, s + half] = mean + even[s] - odd[s]
                 slope[i, s] = even_slope[s] + odd_slope[s]
                 slope[i, s + half] = even_slope[s] - odd_slope[s]
-            for s in range(PAD):
-                rho[i, size + s] = rho[i, s]
-                slope[i, size + s] = slope[i, s]
             high = rho[i, 0]
             low = rho[i, 0]
             for s in range(size):
@@ -288,7 +286,7 @@ def contours(
                         tangent[i, 2 + len(modes) + m] += 0.5 * spacing * im
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def acos_bound(x: float) -> float:
     """Arc cosine to 7e-5 (Abramowitz & Stegun 4.4.45); pi below -1, 0 above 1."""
     if x >= 1.0:
@@ -381,6 +379,248 @@ def variations(g0: float, g1: float, d0: float, d1: float, width: float, margin:
     return 2 if max(b1, b2) > -margin else 0
 
 
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def facing(
+    dx: float, dy: float, distance: float, low_i: float, high_i: float, high_j: float,
+    spacing: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Samples of i's contour that can lie within the reach of j: their middle and their number.
+
+    Both are real numbers, exact to 1e-3 of a sample.
+    """
+    away = distance * distance - high_j * high_j
+    nearest = min(high_i, max(low_i, math.sqrt(max(away, 0.0))))
+    if distance <= 1e-9 * nearest:
+        return 0.0, 2.0 * math.pi / spacing
+    inverse = 1.0 / distance
+    angle = acos_bound(0.5 * (away + nearest * nearest) * inverse / nearest)
+    middle = acos_bound(dx * inverse)
+    return (middle if dy >= 0.0 else -middle) / spacing, 2.0 * angle / spacing
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def polish(lane: Any, result: Any, count: int, modes: Any) -> None:
+    """Two Newton steps on every crossing of a chunk, then its data.
+
+    Row k of `lane` starts at k CHUNK: sample direction (2), displacement to j (2), bracket (2),
+    depth at its start (then the angle from the sample), A0 of i and j, depth at its end, slopes
+    times width (2), modes of i and j (real, imaginary). Rows of `result`:
+    direction on i (2), on j (2), rho on i, on j, size of the next Newton step. One buffer each,
+    with constant distances between the rows, is what lets the compiler use vector instructions.
+    """
+    top = len(modes) - 1
+    re_i = np.uint64(12 * CHUNK)
+    im_i = np.uint64((12 + len(modes)) * CHUNK)
+    re_j = np.uint64((12 + 2 * len(modes)) * CHUNK)
+    im_j = np.uint64((12 + 3 * len(modes)) * CHUNK)
+    two, three, four, five = (
+        np.uint64(2 * CHUNK),
+        np.uint64(3 * CHUNK),
+        np.uint64(4 * CHUNK),
+        np.uint64(5 * CHUNK),
+    )
+    six, seven, eight = np.uint64(6 * CHUNK), np.uint64(7 * CHUNK), np.uint64(8 * CHUNK)
+    nine, ten, eleven = np.uint64(9 * CHUNK), np.uint64(10 * CHUNK), np.uint64(11 * CHUNK)
+    for r in range(np.uint64(count)):
+        # Zero of the cubic through the samples by Newton steps: from the chord, or, where an
+        # extremum lies between the samples, from the end beyond which there is none.
+        g0 = lane[six + r]
+        e0 = lane[ten + r]
+        difference = g0 - lane[nine + r]
+        c2 = -3.0 * difference - 2.0 * e0 - lane[eleven + r]
+        c3 = 2.0 * difference + e0 + lane[eleven + r]
+        t = g0 / difference
+        t = 1.0 if e0 * difference > 0.0 else t
+        t = 0.0 if lane[eleven + r] * difference > 0.0 else t
+        for _ in range(6):
+            value = g0 + t * (e0 + t * (c2 + t * c3))
+            rate = e0 + t * (2.0 * c2 + 3.0 * t * c3)
+            t = t - value / (rate if abs(rate) > 1e-300 else 1e-300)
+            t = 1.0 if t > 1.0 else t
+            t = 0.0 if t < 0.0 else t
+        lane[six + r] = lane[four + r] + t * (lane[five + r] - lane[four + r])
+    for step in range(3):
+        for r in range(np.uint64(count)):
+            angle = lane[six + r]
+            q = angle * angle
+            sine = angle * (
+                1.0
+                + q * (-1 / 6 + q * (1 / 120 + q * (-1 / 5040 + q * (1 / 362880 - q / 39916800))))
+            )
+            cosine = 1.0 + q * (
+                -0.5
+                + q
+                * (1 / 24 + q * (-1 / 720 + q * (1 / 40320 + q * (-1 / 3628800 + q / 479001600))))
+            )
+            c = lane[r] * cosine - lane[ROW + r] * sine
+            s = lane[ROW + r] * cosine + lane[r] * sine
+            pr = lane[re_i + np.uint64(top * CHUNK) + r]
+            pi = lane[im_i + np.uint64(top * CHUNK) + r]
+            qr = (top + 2) * pr
+            qi = (top + 2) * pi
+            for k in range(len(modes) - 1):
+                m = top - 1 - k
+                cr = lane[re_i + np.uint64(m * CHUNK) + r]
+                ci = lane[im_i + np.uint64(m * CHUNK) + r]
+                pr, pi = pr * c - pi * s + cr, pr * s + pi * c + ci
+                qr, qi = qr * c - qi * s + (m + 2) * cr, qr * s + qi * c + (m + 2) * ci
+            zr = c * c - s * s
+            zi = 2.0 * c * s
+            rho = lane[seven + r] + pr * zr - pi * zi
+            slope = -(qr * zi + qi * zr)
+            x = rho * c - lane[two + r]
+            y = rho * s - lane[three + r]
+            tx = slope * c - rho * s
+            ty = slope * s + rho * c
+            square = x * x + y * y
+            inverse = 1.0 / math.sqrt(square)
+            ux = x * inverse
+            uy = y * inverse
+            pr = lane[re_j + np.uint64(top * CHUNK) + r]
+            pi = lane[im_j + np.uint64(top * CHUNK) + r]
+            qr = (top + 2) * pr
+            qi = (top + 2) * pi
+            for k in range(len(modes) - 1):
+                m = top - 1 - k
+                cr = lane[re_j + np.uint64(m * CHUNK) + r]
+                ci = lane[im_j + np.uint64(m * CHUNK) + r]
+                pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
+                qr, qi = qr * ux - qi * uy + (m + 2) * cr, qr * uy + qi * ux + (m + 2) * ci
+            zr = ux * ux - uy * uy
+            zi = 2.0 * ux * uy
+            distance = square * inverse
+            depth = lane[eight + r] + pr * zr - pi * zi - distance
+            change = -(qr * zi + qi * zr) * (ux * ty - uy * tx) * inverse - (ux * tx + uy * ty)
+            newton = depth / change
+            result[r] = c
+            result[ROW + r] = s
+            result[two + r] = ux
+            result[three + r] = uy
+            result[four + r] = rho
+            result[five + r] = distance
+            result[six + r] = abs(newton)
+            moved = angle - newton
+            high = lane[five + r]
+            low = lane[four + r]
+            moved = high if moved > high else moved
+            moved = low if moved < low else moved
+            lane[six + r] = moved if step < 2 else angle
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def finish(
+    lane: Any, result: Any, count: int, cells: Any, record: Any, modes: Any,
+    sign: Any, roots: Any, base: int,
+) -> None:  # fmt: skip
+    """Polish a chunk and store it; what these did not settle is bisected."""
+    padded = (count + LANES - 1) // LANES * LANES
+    for r in range(count, padded):
+        for row in range(12 + 4 * len(modes)):
+            lane[row * CHUNK + r] = lane[row * CHUNK + count - 1]
+    polish(lane, result, padded, modes)
+    for r in range(count):
+        if not result[6 * CHUNK + r] < 1e-10:
+            i = cells[2 * r]
+            j = cells[2 * r + 1]
+            dx = lane[2 * CHUNK + r]
+            dy = lane[3 * CHUNK + r]
+            low = lane[4 * CHUNK + r]
+            high = lane[5 * CHUNK + r]
+            angle = min(high, max(low, lane[6 * CHUNK + r]))
+            for _ in range(80):
+                ca, sa = turn(lane[r], lane[CHUNK + r], angle)
+                g, rate, _, _, _, _, _ = gap(record, i, j, dx, dy, ca, sa, modes)
+                if (g > 0.0) == (sign[base + r] > 0.0):
+                    low = angle
+                else:
+                    high = angle
+                moved = angle - g / rate if rate != 0.0 else low - 1.0
+                if not low < moved < high:
+                    moved = 0.5 * (low + high)
+                step = abs(moved - angle)
+                angle = moved
+                if step < 1e-13 or high - low < 1e-15:
+                    break
+            ca, sa = turn(lane[r], lane[CHUNK + r], angle)
+            _, _, rho, _, distance, ux, uy = gap(record, i, j, dx, dy, ca, sa, modes)
+            result[r] = ca
+            result[CHUNK + r] = sa
+            result[2 * CHUNK + r] = ux
+            result[3 * CHUNK + r] = uy
+            result[4 * CHUNK + r] = rho
+            result[5 * CHUNK + r] = distance
+        for column in range(ROOT):
+            roots[base + r, column] = result[column * CHUNK + r]
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def sample_depth(
+    grid: Any, start: int, count: int, record: Any, j: int, dx: float, dy: float, modes: Any,
+    sampled: Any,
+) -> None:  # fmt: skip
+    """Depth inside j, and its derivative, at `count` samples of a contour from `start` on.
+
+    `grid` holds x, y, dx/dphi and dy/dphi of twice round the contour; `sampled` takes the depths
+    and the derivatives.
+    """
+    twice = np.uint64(16 * max(6, len(modes) + 1))
+    at_y = np.uint64(start) + twice
+    at_tx = at_y + twice
+    at_ty = at_tx + twice
+    at_x = np.uint64(start)
+    top = len(modes) - 1
+    for s in range(np.uint64(count)):
+        x = grid[at_x + s] - dx
+        y = grid[at_y + s] - dy
+        tx = grid[at_tx + s]
+        ty = grid[at_ty + s]
+        q = x * x + y * y
+        q = q if q > 1e-300 else 1e-300
+        inverse = 1.0 / math.sqrt(q)
+        ux = x * inverse
+        uy = y * inverse
+        pr = record[j, HEAD + top]
+        pi = record[j, HEAD + len(modes) + top]
+        qr = (top + 2) * pr
+        qi = (top + 2) * pi
+        for k in range(len(modes) - 1):
+            m = top - 1 - k
+            cr = record[j, HEAD + m]
+            ci = record[j, HEAD + len(modes) + m]
+            pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
+            qr, qi = qr * ux - qi * uy + (m + 2) * cr, qr * uy + qi * ux + (m + 2) * ci
+        zr = ux * ux - uy * uy
+        zi = 2.0 * ux * uy
+        sampled[s] = record[j, 2] + pr * zr - pi * zi - q * inverse
+        sampled[twice + s] = -(qr * zi + qi * zr) * (ux * ty - uy * tx) * inverse - (
+            ux * tx + uy * ty
+        )
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def find_suspects(sampled: Any, count: int, twice: int, spacing: float, margin: float) -> None:
+    """Mark the gaps between samples in which `variations` is not zero, in the third row."""
+    slopes = np.uint64(twice)
+    marks = np.uint64(2 * twice)
+    third = spacing * (1 / 3)
+    one = np.uint64(1)
+    for s in range(np.uint64(count)):
+        g0 = sampled[s]
+        g1 = sampled[s + one]
+        b1 = g0 + sampled[slopes + s] * third
+        b2 = g1 - sampled[slopes + s + one] * third
+        low = g0 if g0 < g1 else g1
+        high = g0 if g0 > g1 else g1
+        inner_low = b1 if b1 < b2 else b2
+        inner_high = b1 if b1 > b2 else b2
+        inner_low = inner_low - margin
+        inner_high = inner_high + margin
+        low = low if low < inner_low else inner_low
+        high = high if high > inner_high else inner_high
+        # All four coefficients on one side of zero, the inner ones by the margin: no crossing.
+        sampled[marks + s] = 1.0 if low <= 0.0 and high > 0.0 else 0.0
+
+
 @njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
 def crossings(
     record: Any,
@@ -393,7 +633,6 @@ def crossings(
     shift: Any,
     modes: Any,
     roots: Any,
-    root_pair: Any,
     root_first: Any,
     root_last: Any,
     sign: Any,
@@ -404,31 +643,41 @@ def crossings(
 
     The depth of i's contour inside j is sampled on the facing part only. The cubic through two
     neighbouring samples shows whether there is no crossing between them, one, or a reason to look
-    closer (a grazing contact); crossings are then polished by Newton steps, all of a block at once.
+    closer (a grazing contact); crossings are then polished by Newton steps, many at once.
     """
     n_cells = record.shape[0]
-    size = table.shape[1] - PAD
+    size = 8 * max(6, len(modes) + 1)
+    twice = 2 * size
     spacing = 2.0 * math.pi / size
     n_blocks = (n_cells + BLOCK - 1) // BLOCK
     room = roots.shape[0] // n_blocks
     for block in prange(n_blocks):
-        begin = block * BLOCK
-        end = min(n_cells, begin + BLOCK)
         base = block * room
-        depth = np.empty(size + 2 * LANES)
-        change = np.empty(size + 2 * LANES)
+        grid = np.empty(4 * twice)
+        sampled = np.empty(3 * twice)
         stack = np.empty((40, 6))
-        bracket = np.empty((8, room))
-        dx_of, dy_of, cos_of, sin_of = bracket[0], bracket[1], bracket[2], bracket[3]
-        left_of, width_of, guess_of, last_of = bracket[4], bracket[5], bracket[6], bracket[7]
-        i_of = np.empty(room, np.int64)
-        j_of = np.empty(room, np.int64)
+        lane = np.empty((12 + 4 * len(modes)) * CHUNK)
+        result = np.empty(7 * CHUNK)
+        cells = np.empty(2 * CHUNK, np.int64)
         count = 0
-        for i in range(begin, end):
+        done = 0
+        for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
+            at_y, at_tx, at_ty = np.uint64(twice), np.uint64(2 * twice), np.uint64(3 * twice)
+            for s in range(np.uint64(size)):
+                c = table[0, s]
+                d = table[1, s]
+                r = rho[i, s]
+                dr = slope[i, s]
+                grid[s] = r * c
+                grid[at_y + s] = r * d
+                grid[at_tx + s] = dr * c - r * d
+                grid[at_ty + s] = dr * d + r * c
+            for row in range(4):
+                begin = row * twice
+                grid[begin + size : begin + twice] = grid[begin : begin + size]
             x_i = record[i, 0]
             y_i = record[i, 1]
             high_i = record[i, 3]
-            low_i = lowest[i]
             for p in range(first[i], first[i + 1]):
                 root_first[p] = base + count
                 root_last[p] = base + count
@@ -440,86 +689,46 @@ def crossings(
                 high_j = record[j, 3]
                 if square >= (high_i + high_j) * (high_i + high_j):
                     continue
-                # The part of i's contour that can lie within the largest radius of j.
-                away = square - high_j * high_j
                 distance = math.sqrt(square)
-                nearest = min(high_i, max(low_i, math.sqrt(max(away, 0.0))))
-                reach = math.pi
-                if distance > 1e-9 * nearest:
-                    reach = acos_bound((away + nearest * nearest) / (2.0 * distance * nearest))
-                n_chunks = int((2.0 * reach / spacing + 2.5 + LANES) / LANES)
-                n_samples = n_chunks * LANES
+                centre, width = facing(dx, dy, distance, lowest[i], high_i, high_j, spacing)
+                n_samples = int((width + 2.5 + LANES) / LANES) * LANES
                 start = 0
-                if n_samples >= size:
-                    n_chunks = size // LANES
-                    n_samples = size + 1
+                whole = n_samples >= size
+                if whole:
+                    n_samples = size
                 else:
-                    centre = math.atan2(dy, dx) / spacing
                     start = math.floor(centre - 0.5 * (n_samples - 1) + 0.5)
                     start = (start + 2 * size) % size
+                sample_depth(grid, start, n_samples, record, j, dx, dy, modes, sampled)
                 mean_j = record[j, 2]
-                top = len(modes) - 1
-                for chunk in range(n_chunks):
-                    origin = start + chunk * LANES
-                    if origin >= size:
-                        origin -= size
-                    for lane in range(LANES):
-                        s = origin + lane
-                        cosine = table[0, s]
-                        sine = table[1, s]
-                        r = rho[i, s]
-                        dr = slope[i, s]
-                        x = r * cosine - dx
-                        y = r * sine - dy
-                        tx = dr * cosine - r * sine
-                        ty = dr * sine + r * cosine
-                        q = x * x + y * y
-                        inverse = 1.0 / math.sqrt(max(q, 1e-300))
-                        ux = x * inverse
-                        uy = y * inverse
-                        pr = record[j, HEAD + top]
-                        pi = record[j, HEAD + len(modes) + top]
-                        qr = (top + 2) * pr
-                        qi = (top + 2) * pi
-                        for k in range(len(modes) - 1):
-                            m = top - 1 - k
-                            cr = record[j, HEAD + m]
-                            ci = record[j, HEAD + len(modes) + m]
-                            pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
-                            qr, qi = (
-                                qr * ux - qi * uy + (m + 2) * cr,
-                                qr * uy + qi * ux + (m + 2) * ci,
-                            )
-                        zr = ux * ux - uy * uy
-                        zi = 2.0 * ux * uy
-                        depth[chunk * LANES + lane] = mean_j + pr * zr - pi * zi - q * inverse
-                        change[chunk * LANES + lane] = -(qr * zi + qi * zr) * (
-                            ux * ty - uy * tx
-                        ) * inverse - (ux * tx + uy * ty)
-                if n_samples == size + 1:
-                    depth[size] = depth[0]
-                    change[size] = change[0]
+                if whole:
+                    sampled[size] = sampled[0]
+                    sampled[twice + size] = sampled[twice]
+                    n_samples = size + 1
                     largest = 0.0
                     for s in range(size):
-                        largest = max(largest, abs(depth[s]))
+                        largest = max(largest, abs(sampled[s]))
                     if largest < 1e-12 * mean_j:
                         inside[p] = 1  # the same contour twice: i counts as inside j
                         continue
                 margin = HULL_MARGIN * mean_j
                 looks = 0
+                find_suspects(sampled, n_samples - 1, twice, spacing, margin)
                 for index in range(n_samples - 1):
-                    g0 = depth[index]
-                    g1 = depth[index + 1]
-                    kind = variations(g0, g1, change[index], change[index + 1], spacing, margin)
-                    if kind == 0:
+                    if sampled[2 * twice + index] == 0.0:
                         continue
-                    s = (start + index) % size
+                    g0 = sampled[index]
+                    g1 = sampled[index + 1]
+                    d0 = sampled[twice + index]
+                    d1 = sampled[twice + index + 1]
+                    s = start + index
+                    s = s - size if s >= size else s
                     stack[0, 0] = 0.0
                     stack[0, 1] = spacing
                     stack[0, 2] = g0
                     stack[0, 3] = g1
-                    stack[0, 4] = change[index]
-                    stack[0, 5] = change[index + 1]
+                    stack[0, 4] = d0
+                    stack[0, 5] = d1
                     height = 1
                     while height > 0:
                         height -= 1
@@ -556,83 +765,71 @@ def crossings(
                             if count == room:
                                 fault[block] = OVERFLOW
                                 break
-                            # Zero of the cubic: inverse interpolation, then Newton steps.
-                            t = g0 / (g0 - g1)
-                            e0 = d0 * width
-                            e1 = d1 * width
-                            c2 = 3.0 * (g1 - g0) - 2.0 * e0 - e1
-                            c3 = 2.0 * (g0 - g1) + e0 + e1
-                            for _ in range(3):
-                                value = g0 + t * (e0 + t * (c2 + t * c3))
-                                rate = e0 + t * (2.0 * c2 + 3.0 * t * c3)
-                                t -= value / rate if rate != 0.0 else 0.0
-                                t = min(1.0, max(0.0, t))
-                            dx_of[count] = dx
-                            dy_of[count] = dy
-                            cos_of[count] = table[0, s]
-                            sin_of[count] = table[1, s]
-                            left_of[count] = left
-                            width_of[count] = width
-                            guess_of[count] = left + t * width
-                            i_of[count] = i
-                            j_of[count] = j
+                            r = count - done
+                            lane[r] = table[0, s]
+                            lane[CHUNK + r] = table[1, s]
+                            lane[2 * CHUNK + r] = dx
+                            lane[3 * CHUNK + r] = dy
+                            lane[4 * CHUNK + r] = left
+                            lane[5 * CHUNK + r] = left + width
+                            lane[6 * CHUNK + r] = g0
+                            lane[7 * CHUNK + r] = record[i, 2]
+                            lane[8 * CHUNK + r] = mean_j
+                            lane[9 * CHUNK + r] = g1
+                            lane[10 * CHUNK + r] = d0 * width
+                            lane[11 * CHUNK + r] = d1 * width
+                            for m in range(2 * len(modes)):
+                                lane[(12 + m) * CHUNK + r] = record[i, HEAD + m]
+                                lane[(12 + 2 * len(modes) + m) * CHUNK + r] = record[j, HEAD + m]
+                            cells[2 * r] = i
+                            cells[2 * r + 1] = j
                             sign[base + count] = 1.0 if g0 > 0.0 else -1.0
-                            root_pair[base + count] = p
                             count += 1
+                            if count - done == CHUNK:
+                                finish(
+                                    lane, result, CHUNK, cells, record, modes, sign, roots,
+                                    base + done,
+                                )  # fmt: skip
+                                done = count
                 if count == root_first[p] - base:
-                    if n_samples == size + 1 and depth[0] > 0.0:
+                    if whole and sampled[0] > 0.0:
                         inside[p] = 1
                     elif distance + lowest[j] < high_i:
                         g, _, _, _, _, _, _ = gap(record, j, i, -dx, -dy, 1.0, 0.0, modes)
                         if g > 0.0:
                             inside[p] = 2
                 root_last[p] = base + count
-        # Newton steps on all crossings of the block; two suffice after the cubic.
-        for r in range(count):
-            angle = guess_of[r]
-            step = 0.0
-            for _ in range(2):
-                ca, sa = turn(cos_of[r], sin_of[r], angle)
-                g, rate, _, _, _, _, _ = gap(
-                    record, i_of[r], j_of[r], dx_of[r], dy_of[r], ca, sa, modes
-                )
-                step = -g / rate
-                angle = min(left_of[r] + width_of[r], max(left_of[r], angle + step))
-            guess_of[r] = angle
-            last_of[r] = abs(step)
-        for r in range(count):
-            angle = guess_of[r]
-            if not last_of[r] < 1e-8:
-                low = left_of[r]
-                high = left_of[r] + width_of[r]
-                if not low <= angle <= high:
-                    angle = 0.5 * (low + high)
-                for _ in range(80):
-                    ca, sa = turn(cos_of[r], sin_of[r], angle)
-                    g, rate, _, _, _, _, _ = gap(
-                        record, i_of[r], j_of[r], dx_of[r], dy_of[r], ca, sa, modes
-                    )
-                    if (g > 0.0) == (sign[base + r] > 0.0):
-                        low = angle
-                    else:
-                        high = angle
-                    moved = angle - g / rate if rate != 0.0 else low - 1.0
-                    if not low < moved < high:
-                        moved = 0.5 * (low + high)
-                    step = abs(moved - angle)
-                    angle = moved
-                    if step < 1e-15 or high - low < 1e-15:
-                        break
-            ca, sa = turn(cos_of[r], sin_of[r], angle)
-            _, _, rho_i, _, rho_j, ux, uy = gap(
-                record, i_of[r], j_of[r], dx_of[r], dy_of[r], ca, sa, modes
-            )
-            roots[base + r, 0] = ca
-            roots[base + r, 1] = sa
-            roots[base + r, 2] = ux
-            roots[base + r, 3] = uy
-            roots[base + r, 4] = rho_i
-            roots[base + r, 5] = rho_j
+        if count > done:
+            finish(lane, result, count - done, cells, record, modes, sign, roots, base + done)
+
+
+@njit(cache=True, fastmath=REDUCE, error_model="numpy")
+def add_powers(side: Any, filled: int, wr: Any, wi: Any) -> None:
+    """Add sign exp(i n phi) / i of every crossing to the sums of n = 1, 2, ...
+
+    Rows of `side`, CHUNK apart: sign, cosine and sine of phi, then room for the powers.
+    """
+    padded = (filled + LANES - 1) // LANES * LANES
+    for r in range(filled, padded):
+        side[r] = 0.0
+        side[CHUNK + r] = 1.0
+        side[2 * CHUNK + r] = 0.0
+    two, three, four = np.uint64(2 * CHUNK), np.uint64(3 * CHUNK), np.uint64(4 * CHUNK)
+    for r in range(np.uint64(padded)):
+        side[three + r] = side[r] * side[ROW + r]
+        side[four + r] = side[r] * side[two + r]
+    for n in range(1, wr.shape[0]):
+        re = 0.0
+        im = 0.0
+        for r in range(np.uint64(padded)):
+            c = side[three + r]
+            s = side[four + r]
+            re += s
+            im -= c
+            side[three + r] = c * side[ROW + r] - s * side[two + r]
+            side[four + r] = s * side[ROW + r] + c * side[two + r]
+        wr[n] += re
+        wi[n] += im
 
 
 @njit(cache=True, parallel=True, fastmath=REDUCE, error_model="numpy")
@@ -671,6 +868,7 @@ def exact_velocity(
     for block in prange(n_blocks):
         wr = np.empty(n_powers)
         wi = np.empty(n_powers)
+        side = np.empty(5 * CHUNK)
         for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
             for m in range(n_powers):
                 wr[m] = 0.0
@@ -679,6 +877,9 @@ def exact_velocity(
             fy = 0.0
             spin = 0.0
             lens = 0.0
+            filled = 0
+            arcs_r = 1.0
+            arcs_i = 0.0
             n_own = first[i + 1] - first[i]
             n_all = n_own + back_first[i + 1] - back_first[i]
             for entry in range(n_all):
@@ -711,24 +912,35 @@ def exact_velocity(
                     fy -= s * distance * c1
                     spin += 0.5 * s * distance * distance
                     arc_r, arc_i = arc_r * c1 - s * arc_i * s1, arc_i * c1 + s * arc_r * s1
-                    cn = c1
-                    sn = s1
-                    for n in range(1, n_powers):
-                        wr[n] += s * sn
-                        wi[n] -= s * cn
-                        cn, sn = cn * c1 - sn * s1, sn * c1 + cn * s1
+                    side[filled] = s
+                    side[CHUNK + filled] = c1
+                    side[2 * CHUNK + filled] = s1
+                    filled += 1
+                    if filled == CHUNK:
+                        add_powers(side, filled, wr, wi)
+                        filled = 0
+                if arc_r > 0.0 and arc_i >= 0.0:
+                    # Short arcs are turned together; their sum is below pi until it is taken.
+                    arcs_r, arcs_i = (
+                        arcs_r * arc_r - arcs_i * arc_i,
+                        arcs_r * arc_i + arcs_i * arc_r,
+                    )
+                    if arcs_r <= 0.0:
+                        wr[0] += math.atan2(arcs_i, arcs_r)
+                        arcs_r = 1.0
+                        arcs_i = 0.0
+                    continue
                 angle = math.atan2(arc_i, arc_r)
                 if angle < 0.0:
                     angle += 2.0 * math.pi
                     if angle > 2.0 * math.pi - 1e-6:
                         # Round-off, or a cell inside but for a sliver: ask its far side.
                         r = root_first[p]
-                        j = other[p] if own else i
                         dx = roots[r, 4] * roots[r, 0] - roots[r, 5] * roots[r, 2]
                         dy = roots[r, 4] * roots[r, 1] - roots[r, 5] * roots[r, 3]
                         if own:
                             g, _, _, _, _, _, _ = gap(
-                                record, i, j, dx, dy, -roots[r, 0], -roots[r, 1], modes
+                                record, i, other[p], dx, dy, -roots[r, 0], -roots[r, 1], modes
                             )
                         else:
                             j = back_cell[back_first[i] + entry - n_own]
@@ -738,6 +950,9 @@ def exact_velocity(
                         if g <= 0.0:
                             angle = 0.0
                 wr[0] += angle
+            wr[0] += math.atan2(arcs_i, arcs_r)
+            if filled > 0:
+                add_powers(side, filled, wr, wi)
             # W_n = (exp(i n phi_out) - exp(i n phi_in)) / (i n), summed above without 1/n.
             for n in range(1, n_powers):
                 wr[n] /= n
@@ -824,12 +1039,14 @@ def quadrature_velocity(
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
     n_cells = state.shape[0]
-    size = table.shape[1] - PAD
+    size = table.shape[1]
     spacing = 2.0 * math.pi / size
     half = size // 2
     n_blocks = (n_cells + BLOCK - 1) // BLOCK
     for block in prange(n_blocks):
-        held = np.empty(size + PAD)
+        held = np.empty(2 * size)
+        grid_x = np.empty(2 * size)
+        grid_y = np.empty(2 * size)
         u = np.empty(size)
         v = np.empty(size)
         even = np.empty(half)
@@ -837,8 +1054,14 @@ def quadrature_velocity(
         even_slope = np.empty(half)
         odd_slope = np.empty(half)
         for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
-            for s in range(size + PAD):
+            for s in range(size):
                 held[s] = 0.0
+                held[size + s] = 0.0
+                grid_x[s] = rho[i, s] * table[0, s]
+                grid_y[s] = rho[i, s] * table[1, s]
+            for s in range(size):
+                grid_x[size + s] = grid_x[s]
+                grid_y[size + s] = grid_y[s]
             high_i = record[i, 3]
             n_own = first[i + 1] - first[i]
             n_all = n_own + back_first[i + 1] - back_first[i]
@@ -857,45 +1080,35 @@ def quadrature_velocity(
                 high_j = record[j, 3]
                 if square >= (high_i + high_j) * (high_i + high_j):
                     continue
-                away = square - high_j * high_j
-                nearest = min(high_i, max(lowest[i], math.sqrt(max(away, 0.0))))
-                reach = math.pi
                 distance = math.sqrt(square)
-                if distance > 1e-9 * nearest:
-                    reach = acos_bound((away + nearest * nearest) / (2.0 * distance * nearest))
-                n_chunks = int((2.0 * reach / spacing + 1.5 + LANES) / LANES)
+                centre, width = facing(dx, dy, distance, lowest[i], high_i, high_j, spacing)
+                n_samples = int((width + 2.5 + LANES) / LANES) * LANES
                 start = 0
-                if n_chunks * LANES >= size:
-                    n_chunks = (size + LANES - 1) // LANES
+                if n_samples >= size:
+                    n_samples = size
                 else:
-                    centre = math.atan2(dy, dx) / spacing
-                    start = math.floor(centre - 0.5 * (n_chunks * LANES - 1) + 0.5)
+                    start = math.floor(centre - 0.5 * (n_samples - 1) + 0.5)
                     start = (start + 2 * size) % size
                 mean_j = record[j, 2]
                 top = len(modes) - 1
-                for chunk in range(n_chunks):
-                    origin = start + chunk * LANES
-                    if origin >= size:
-                        origin -= size
-                    stop = size + start if n_chunks * LANES >= size else size + PAD
-                    for lane in range(LANES):
-                        s = origin + lane
-                        x = rho[i, s] * table[0, s] - dx
-                        y = rho[i, s] * table[1, s] - dy
-                        q = x * x + y * y
-                        inverse = 1.0 / math.sqrt(max(q, 1e-300))
-                        ux = x * inverse
-                        uy = y * inverse
-                        pr = record[j, HEAD + top]
-                        pi = record[j, HEAD + len(modes) + top]
-                        for m in range(len(modes) - 1):
-                            cr = record[j, HEAD + top - 1 - m]
-                            ci = record[j, HEAD + len(modes) + top - 1 - m]
-                            pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
-                        depth = mean_j + pr * (ux * ux - uy * uy) - pi * (2.0 * ux * uy)
-                        depth -= q * inverse
-                        held[s] += 1.0 if depth > 0.0 and s < stop else 0.0
-            for s in range(PAD):
+                offset = np.uint64(start)
+                for s in range(np.uint64(n_samples)):
+                    x = grid_x[offset + s] - dx
+                    y = grid_y[offset + s] - dy
+                    q = x * x + y * y
+                    q = q if q > 1e-300 else 1e-300
+                    inverse = 1.0 / math.sqrt(q)
+                    ux = x * inverse
+                    uy = y * inverse
+                    pr = record[j, HEAD + top]
+                    pi = record[j, HEAD + len(modes) + top]
+                    for lower in range(len(modes) - 1):
+                        cr = record[j, HEAD + top - 1 - lower]
+                        ci = record[j, HEAD + len(modes) + top - 1 - lower]
+                        pr, pi = pr * ux - pi * uy + cr, pr * uy + pi * ux + ci
+                    depth = mean_j + pr * (ux * ux - uy * uy) - pi * (2.0 * ux * uy)
+                    held[offset + s] += 1.0 if depth > q * inverse else 0.0
+            for s in range(size):
                 held[s] += held[size + s]
             fx = 0.0
             fy = 0.0

@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,40 +23,17 @@ from cellquant.sim.archive import (
 )
 from cellquant.sim.contacts import ContactRule, Layer
 from cellquant.sim.initial import initial_state
-from cellquant.sim.integrators import find_method
-from cellquant.sim.noise import BrownianTree
+from cellquant.sim.integrators import find_method, recommended
 from cellquant.sim.scene import Scene, SimulationFailure
+from cellquant.sim.steps import AdaptiveSteps, FixedSteps, Plan
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
-ROOT_DEPTH = 2  # a root of the Brownian tree spans 2^2 steps
-WATCH_EVERY = 16  # steps between two checks of the step length
-CHATTER_LIMIT = 0.02  # RMS change of the displacement from one step to the next, L0
 CELLS_PER_THREAD = 256  # a thread with fewer cells waits longer than it works
 CHECKPOINT_EVERY = 20.0  # seconds of wall time
+TOLERANCE = 1e-3  # of the adaptive method, L0
 FRAMES_IN_MEMORY = 2_000_000  # numbers of buffered frames before they are written
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Steps of a run: n_before frames' worth of transient, then n_frames - 1 saved intervals."""
-
-    h: float
-    steps_per_frame: int
-    n_before: int
-    n_frames: int
-
-    @classmethod
-    def of(cls, duration: float, transient: float, save_every: float, dt: float) -> "Plan":
-        """Divide the frame interval into equal steps no longer than dt."""
-        steps = max(1, math.ceil(save_every / dt * (1.0 - 1e-12)))
-        return cls(
-            h=save_every / steps,
-            steps_per_frame=steps,
-            n_before=math.ceil(transient / save_every * (1.0 - 1e-12)),
-            n_frames=1 + math.ceil(duration / save_every * (1.0 - 1e-12)),
-        )
 
 
 def simulate(
@@ -94,7 +70,7 @@ def simulate(
     dt
         Longest step, t0; None for the usual one of the method. Steps divide `save_every`.
     tolerance
-        Error per step of the adaptive method, L0; only with it.
+        RMS error of the centres that a step of the adaptive method may make, L0; chooses it.
     save_every
         Time between saved states, t0; None for the larger of 1 and duration / 2000.
     output
@@ -124,21 +100,24 @@ def simulate(
     if save_every is None and duration < 1.0:
         frame_interval = duration
     _positive("save_every", frame_interval)
+    if integrator is None:
+        integrator = recommended(scene, contact) if tolerance is None else "adaptive"
     name, method = find_method(integrator)
     if dt is not None:
         _positive("dt", dt)
     if tolerance is not None:
         _positive("tolerance", tolerance)
-    if (tolerance is not None) != method.adaptive and (tolerance is not None or dt is not None):
-        kind = "needs a tolerance and no dt" if method.adaptive else "takes dt and no tolerance"
-        raise InputError(f"the integrator {name} {kind}; change the options.")
-    plan = Plan.of(duration, transient, frame_interval, dt or method.dt)
+    if (dt if method.adaptive else tolerance) is not None:
+        kind = "a tolerance and no dt" if method.adaptive else "dt and no tolerance"
+        raise InputError(f"the integrator {name} takes {kind}; change the options.")
+    longest = frame_interval if method.adaptive else (dt or method.dt)
+    plan = Plan.of(duration, transient, frame_interval, longest)
     settings = {
         "contact": contact,
         "points": points if contact == "quadrature" else None,
         "integrator": name,
-        "dt": plan.h,
-        "tolerance": tolerance if tolerance is not None or not method.adaptive else method.dt,
+        "dt": None if method.adaptive else plan.h,
+        "tolerance": (tolerance or TOLERANCE) if method.adaptive else None,
         "save_every": frame_interval,
         "transient": plan.n_before * frame_interval,
         "duration": (plan.n_frames - 1) * frame_interval,
@@ -182,7 +161,11 @@ class _Simulation:
         self.path = None if output is None else Path(output)
         self.state, radius, box = initial_state(scene)
         self.layer = Layer(scene, radius, box, contact=settings["contact"], points=points)
-        self.steps = FixedSteps(self.layer, settings["integrator"], plan)
+        self.steps: FixedSteps | AdaptiveSteps
+        if settings["tolerance"] is None:
+            self.steps = FixedSteps(self.layer, settings["integrator"], plan)
+        else:
+            self.steps = AdaptiveSteps(self.layer, plan, settings["tolerance"])
         self.interval = 0  # frame intervals done, those of the transient included
         self.cpu = 0.0
         self.buffer: list[tuple[float, Floats]] = []
@@ -319,70 +302,3 @@ class _Simulation:
             reference=reference,
             steps=self.steps.save(),
         )
-
-
-class FixedSteps:
-    """Equal steps of one method, watched for steps that are too long.
-
-    Attributes
-    ----------
-    count, rejected
-        Steps taken and given up.
-    elapsed
-        Time since the start of the frame interval, t0.
-    """
-
-    def __init__(self, layer: Layer, integrator: str, plan: Plan) -> None:
-        self.layer = layer
-        self.plan = plan
-        self.count = 0
-        self.rejected = 0
-        self.elapsed = 0.0
-        self._method = find_method(integrator)[1].make(layer)
-        self._tree = BrownianTree(layer.scene.seed, len(layer.radius), plan.h * 2**ROOT_DEPTH)
-        self._still = np.zeros(len(layer.radius))
-        self._chatter = 0.0
-
-    def save(self) -> Floats:
-        """What a checkpoint has to keep."""
-        return np.array([self.count, self._chatter])
-
-    def restore(self, stored: Floats) -> None:
-        """Go on from what `save` returned."""
-        self.count, self._chatter = int(stored[0]), float(stored[1])
-
-    def advance(self, state: Floats, interval: int) -> None:
-        """Advance a state over one frame interval, in place."""
-        steps = self.plan.steps_per_frame
-        leaves = 2**ROOT_DEPTH
-        before = state[:, :2].copy()
-        moved: Floats | None = None
-        for index in range(interval * steps, (interval + 1) * steps):
-            w = area = self._still
-            if self.layer.scene.has_noise:
-                ws, areas = self._tree.level(index // leaves, ROOT_DEPTH)
-                w, area = ws[index % leaves], areas[index % leaves]
-            watched = index % WATCH_EVERY < 2
-            if watched:
-                before[:] = state[:, :2]
-            self._method.step(state, self.plan.h, w, area)
-            self.count += 1
-            self.elapsed = (index + 1 - interval * steps) * self.plan.h
-            if watched:
-                previous, moved = moved, state[:, :2] - before
-                self._watch(moved, previous if index % WATCH_EVERY == 1 else None)
-        self.elapsed = 0.0
-
-    def _watch(self, moved: Floats, previous: Floats | None) -> None:
-        """Stop where cells jump, or where the displacement changes too much from step to step."""
-        remedy = "take a smaller dt or the adaptive integrator"
-        reach = float(np.abs(moved).max())
-        if not reach < 0.5 * self.layer.scene.mean_radius:
-            cell = int(np.argmax(np.abs(moved).max(axis=1)))
-            raise SimulationFailure("a cell jumped within one step", remedy, cell=cell)
-        if previous is None:
-            return
-        change = float(np.sqrt(np.mean((moved - previous) ** 2)))
-        self._chatter += 0.2 * (change / (2.0 * self.layer.scene.mean_radius) - self._chatter)
-        if self._chatter > CHATTER_LIMIT:
-            raise SimulationFailure("the step is too long for the contacts, which chatter", remedy)
