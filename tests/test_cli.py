@@ -240,6 +240,59 @@ def test_units_pixel_needs_no_calibration(movie: Path, tmp_path: Path) -> None:
     assert "px" in done.stdout
 
 
+def one_cell(movie: np.ndarray) -> np.ndarray:
+    return np.where(movie == 1, movie, 0)
+
+
+def empty_frame_inside(movie: np.ndarray) -> np.ndarray:
+    movie[12] = 0
+    return movie
+
+
+def large_labels(movie: np.ndarray) -> np.ndarray:
+    return np.where(movie > 0, movie.astype(np.uint32) + 70_000, 0).astype(np.uint32)
+
+
+def all_at_the_border(movie: np.ndarray) -> np.ndarray:
+    stripes = np.zeros_like(movie)
+    for label, left in enumerate((0, 24, 48, 72), start=1):
+        stripes[::2, :, left + 1 : left + 23] = label
+        stripes[1::2, :, left + 1 : left + 22] = label
+    return stripes
+
+
+@pytest.mark.parametrize(
+    ("make", "tracks"),
+    [(one_cell, 1), (empty_frame_inside, 4), (large_labels, 4), (all_at_the_border, 4)],
+    ids=lambda value: getattr(value, "__name__", str(value)),
+)
+def test_unusual_but_good_input(
+    make: Callable[[np.ndarray], np.ndarray], tracks: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "masks.tif"
+    tifffile.imwrite(path, make(drifting_discs(30, step=(0.5, 0.2))))
+    out = tmp_path / "out"
+    done = cellquant("track", path, "-o", out, *CALIBRATED)
+    assert done.returncode == 0, done.stderr
+    table = pd.read_parquet(out / "tracks.parquet")
+    assert table["track_id"].nunique() == tracks
+    assert len(table) == tracks * (29 if make is empty_frame_inside else 30)
+    if make is empty_frame_inside:
+        # The gap is bridged, and the missing frame keeps its place in time.
+        assert 12 not in set(table["frame"])
+        assert "1 empty frame" in done.stdout
+    if make is large_labels:
+        assert set(table["label"]) == {70_001, 70_002, 70_003, 70_004}
+    if make is all_at_the_border:
+        assert table["touches_border"].all()
+    observed = cellquant("observe", out, "-o", out)
+    assert observed.returncode == 0, observed.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    if make is all_at_the_border:
+        assert summary["shape_index"]["mean"] is None
+        assert summary["shape_index"]["reason"]
+
+
 def test_unwritable_output(movie: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     done = cellquant("track", movie, "-o", tmp_path / "file", *CALIBRATED)
