@@ -10,6 +10,7 @@ from cellquant.tables import read_table, write_table
 if TYPE_CHECKING:
     import pandas as pd
 
+    from cellquant.compare.page import Section
     from cellquant.compare.results import Result
 
 SCALARS = (
@@ -165,10 +166,9 @@ def _write_report(
     results: "Sequence[Result]",
     record: Mapping[str, Any],
 ) -> None:
-    from cellquant.compare import panels
     from cellquant.compare.page import Page, Row, Section, Table, write_page
     from cellquant.compare.report import methods_section, scalar_text, warnings_section
-    from cellquant.compare.results import read_scalars, reasons
+    from cellquant.compare.results import read_scalars
 
     scalars = [{scalar.key: scalar for scalar in read_scalars(result)} for result in results]
     shown = [key for key in SCALARS if any(key in found for found in scalars)]
@@ -197,29 +197,47 @@ def _write_report(
         rows=rows,
         data=stack_table(tasks, results),
     )
+    names = list(dict.fromkeys(str(task["condition"]) for task in tasks))
+    trials = len({(task["condition"], task["trial"]) for task in tasks})
+    write_page(
+        Page(
+            title="Study",
+            lede=f"{_count(len(names), 'condition')}, {_count(trials, 'independent trial')} and "
+            f"{_count(len(tasks), 'stack')}. Each stack has a report of its own beside its tables.",
+            sections=(
+                Section("results", "Results by stack", tables=(table,)),
+                *_curves(path.parent, names, results),
+                warnings_section({}, record, {}, []),
+                methods_section([("", record)]),
+            ),
+        ),
+        path,
+    )
+
+
+def _curves(
+    folder: Path, conditions: Sequence[str], results: "Sequence[Result]"
+) -> "tuple[Section, ...]":
+    """The conditions side by side; the stacks themselves where there is one condition."""
+    if len(conditions) > 1:
+        from cellquant.compare import compare
+        from cellquant.compare.comparison_page import build_comparison
+
+        page = build_comparison(compare(*(folder / "stacks" / name for name in conditions)))
+        return page.sections[:-1]
+    from cellquant.compare import panels
+    from cellquant.compare.page import Section
+
     drawn = results[:MAX_CURVES]
-    figures = [
+    figures = (
         panels.shape_figure(drawn),
         panels.scattering_figure(drawn),
         panels.msd_figure(drawn),
-    ]
+    )
     rest = len(results) - len(drawn)
     note = (f"The curves of the first {MAX_CURVES} stacks are drawn.",) if rest > 0 else ()
-    conditions = len({task["condition"] for task in tasks})
-    trials = len({(task["condition"], task["trial"]) for task in tasks})
-    page = Page(
-        title="Study",
-        lede=f"{_count(conditions, 'condition')}, {_count(trials, 'independent trial')} and "
-        f"{_count(len(tasks), 'stack')}. Each stack has a report of its own beside its tables.",
-        sections=(
-            Section("results", "Results by stack", tables=(table,)),
-            Section("curves", "Shape, memory and motion", text=note,
-                    figures=tuple(figure for figure in figures if figure is not None)),
-            warnings_section({}, record, {}, [text for r in results for text in reasons(r)]),
-            methods_section([("", record)]),
-        ),
-    )  # fmt: skip
-    write_page(page, path)
+    shown = tuple(figure for figure in figures if figure is not None)
+    return (Section("curves", "Shape, memory and motion", text=note, figures=shown),)
 
 
 def _count(number: int, noun: str) -> str:

@@ -149,7 +149,8 @@ def format_value(value: float | None, std_error: float | None = None) -> str:
     """
     if value is None or not math.isfinite(value):
         return "\N{EN DASH}"
-    if std_error is None or not math.isfinite(std_error) or std_error <= 0:
+    # An error at the level of round-off is none: every part of the sample gave the same number.
+    if std_error is None or not math.isfinite(std_error) or std_error <= 1e-12 * abs(value):
         return _plain(value, 3 - _magnitude(value))
     digits = 1 - _magnitude(float(f"{std_error:.1e}"))
     return f"{_plain(value, digits)} ± {_plain(std_error, digits)}"
