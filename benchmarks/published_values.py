@@ -16,7 +16,12 @@ from cellquant.sim import Scene, simulate
 
 RESULTS = Path(__file__).parent / "results"
 POINTS = [
-    {"phi": 0.97, "v0": 0.03, "eta": 0.01, "published": {"p": 3.800, "sigma2": 0.103, "xi": 0.0692}},
+    {
+        "phi": 0.97,
+        "v0": 0.03,
+        "eta": 0.01,
+        "published": {"p": 3.800, "sigma2": 0.103, "xi": 0.0692},
+    },
     {"phi": 0.95, "v0": 0.03, "eta": 0.01, "published": {"p": 3.751}},
 ]
 RULES = {

@@ -169,7 +169,8 @@ class Layer:
         if not self.scene.rigid:
             return pairs[(self._root_last > self._root_first) | (self._inside > 0)]
         apart = state[pairs[:, 1], :2] + self._shift - state[pairs[:, 0], :2]
-        return pairs[np.hypot(*apart.T) < self.radius[pairs].sum(axis=1)]
+        near: NDArray[np.bool_] = np.hypot(*apart.T) < self.radius[pairs].sum(axis=1)
+        return pairs[near]
 
     def gather_stiffness(
         self, state: Floats, scale: Floats, weight: Any, factor: Any, turning: Any, cells: Any
