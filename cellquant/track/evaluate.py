@@ -100,11 +100,12 @@ def evaluate(tracks: Tracks, truth: str | Path, *, frame_tolerance: int = 1) -> 
     Matula et al. (2015), PLoS ONE 10, e0144959, doi:10.1371/journal.pone.0144959.
     Ristani et al. (2016), ECCV workshops, doi:10.1007/978-3-319-48881-3_2.
     """
-    true_table = read_truth(truth, pixel_size=_pixel_size(tracks))
+    true_table = read_truth(truth, pixel_size=pixel_size_of(tracks))
     return score_tables(tracks.table, true_table, frame_tolerance=frame_tolerance)
 
 
-def _pixel_size(tracks: Tracks) -> float:
+def pixel_size_of(tracks: Tracks) -> float:
+    """Edge of a pixel in the unit of the tracks."""
     if tracks.units.length == "px":
         return 1.0
     known = tracks.provenance.get("pixel_size")
