@@ -68,7 +68,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             simulated=True,
             tau=90 + 20 * i,
             shape=3.75 + 0.02 * i,
-        ).result(f"φ = 0.97, v_{{0}} = {0.01 * (i + 1):g}")
+        ).result(f"φ = 0.97, v₀ = {0.01 * (i + 1):g}")
         for i in range(9)
     ]
     for i, scene in enumerate(scenes):

@@ -294,7 +294,7 @@ def _units_section(comparison: Comparison, pairs: Pairs) -> Section | None:
         tables.append(
             Table("units", "L_{0} so that the mean diameters coincide, t_{0} so that the "
                   "relaxation times coincide.",
-                  ("Pair", "L_{0}", "t_{0}", "v_{0} of the scene"),
+                  ("Pair", "L_{0}", "t_{0}", "v₀ of the scene"),
                   ("", "number", "number", "number"), tuple(rows))
         )  # fmt: skip
     area, error = comparison.area

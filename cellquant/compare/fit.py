@@ -16,7 +16,7 @@ from cellquant.errors import InputError
 if TYPE_CHECKING:
     from cellquant.compare.comparison import Comparison
 
-SYMBOLS = {"phi": "φ", "v0": "v_{0}", "eta": "η"}
+SYMBOLS = {"phi": "φ", "v0": "v₀", "eta": "η"}
 FEATURES = {
     "shape_index.mean": "⟨p⟩",
     "shape_index.std": "width of P(p)",

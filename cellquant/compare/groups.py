@@ -172,7 +172,7 @@ def _place(result: Result, path: Path, scene: Mapping[str, float]) -> tuple[str,
 
 
 def _scene_name(scene: Mapping[str, float]) -> str:
-    symbols = {"phi": "φ", "v0": "v_{0}", "eta": "η"}
+    symbols = {"phi": "φ", "v0": "v₀", "eta": "η"}
     return ", ".join(f"{symbols[key]} = {value:g}" for key, value in scene.items())
 
 

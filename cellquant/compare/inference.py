@@ -1,6 +1,5 @@
 """Parameters of the model that agree with a layer, with credible regions, from a sweep."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +32,7 @@ class Posterior:
     emulator
         What the likelihood was computed with.
     target
-        Features of the target and their covariance.
+        Features of the target, their own errors, and the errors that they share.
     """
 
     names: tuple[str, ...]
@@ -42,7 +41,7 @@ class Posterior:
     features: tuple[str, ...]
     bounds: Mapping[str, tuple[float, float]]
     emulator: "Emulator"
-    target: tuple[FloatArray, FloatArray]
+    target: tuple[FloatArray, FloatArray, FloatArray]
 
     def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
         """Low end, median and high end of the central interval of one parameter."""
@@ -79,7 +78,7 @@ class Emulator:
     low, high
         Range of each parameter in the sweep.
     correlation
-        Of the features between seeds of a scene.
+        Of the features of a run about what its parameters predict.
     """
 
     names: tuple[str, ...]
@@ -98,13 +97,23 @@ class Emulator:
         return np.column_stack([p[0] for p in pairs]), deviation
 
     def log_likelihood(
-        self, points: FloatArray, value: FloatArray, covariance: FloatArray
+        self, points: FloatArray, value: FloatArray, error: FloatArray, shared: FloatArray
     ) -> FloatArray:
-        """Logarithm of the probability of the observed features at each point."""
+        """Logarithm of the probability of the observed features at each point.
+
+        Parameters
+        ----------
+        points
+            (n, parameters).
+        value, error
+            (features,) observed, with the errors that belong to each alone.
+        shared
+            (features, sources) errors that several features have in common.
+        """
         mean, deviation = self.predict(points)
-        total = np.repeat(covariance[None], len(points), 0)
+        spread = np.hypot(deviation, error)
+        total = self.correlation * spread[:, :, None] * spread[:, None, :] + shared @ shared.T
         diagonal = np.arange(len(value))
-        total[:, diagonal, diagonal] += deviation**2
         factor = np.linalg.cholesky(total)
         z = np.linalg.solve(factor, (value - mean)[..., None])[..., 0]
         volume = np.log(factor[:, diagonal, diagonal]).sum(axis=1)
@@ -155,9 +164,9 @@ def train(candidates: Sequence[Group], features: Sequence[str], *, seed: int = 0
             _gaussian_process(scaled, values[:, i], errors[:, i], seed)
             for i in range(len(features))
         )
-    widen = np.array([_left_out_spread(model) for model in models])
-    correlation = _correlation([group for group, _ in known], features)
-    return Emulator(names, tuple(features), models, widen, low, high, correlation)
+    residuals = np.column_stack([_left_out_residuals(model) for model in models])
+    widen = np.maximum(1.0, np.sqrt((residuals**2).mean(axis=0)))
+    return Emulator(names, tuple(features), models, widen, low, high, _correlation(residuals))
 
 
 def fit_parameters(
@@ -173,8 +182,8 @@ def fit_parameters(
 
     A Gaussian process per feature (anisotropic squared exponential plus a linear trend,
     scikit-learn) is fitted to the scenes; the likelihood of the target's features is Gaussian
-    with the errors of target and emulator, and correlations between features as found between
-    seeds of a scene. The prior is flat over the range of the sweep: nothing is said beyond it.
+    with the errors of target and emulator, correlated as the scenes scatter about the emulator.
+    The prior is flat over the range of the sweep: nothing is said beyond it.
 
     Parameters
     ----------
@@ -216,12 +225,11 @@ def fit_parameters(
     value = np.array([ours[f].value for f in emulator.features])
     error = np.array([ours[f].own_error for f in emulator.features])
     shared = np.array([ours[f].unit_error for f in emulator.features])
-    covariance = emulator.correlation * np.outer(error, error) + shared @ shared.T
     low, high = emulator.low, emulator.high
     start = low + qmc.Sobol(len(low), seed=seed).random(n_points) * (high - low)
     with threadpool_limits(1):  # the matrices are too small for more to pay
         samples, density = _sample(
-            lambda points: emulator.log_likelihood(points, value, covariance),
+            lambda points: emulator.log_likelihood(points, value, error, shared),
             start,
             low,
             high,
@@ -235,7 +243,7 @@ def fit_parameters(
         emulator.features,
         bounds,
         emulator,
-        (value, covariance),
+        (value, error, shared),
     )
 
 
@@ -329,41 +337,26 @@ def _scaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray
     return out
 
 
-def _left_out_spread(model: Any) -> float:
-    """Root mean square of the leave-one-out residuals over their predicted errors, at least 1.
+def _left_out_residuals(model: Any) -> FloatArray:
+    """Residuals of each scene predicted without itself, over their predicted errors.
 
     With K the covariance of the data, the residual of point i predicted from the others is
     ``[K^-1 y]_i / [K^-1]_ii`` and its variance ``1 / [K^-1]_ii`` (Rasmussen & Williams, 5.4.2).
     """
     covariance = model.kernel_(model.X_train_) + np.diag(model.alpha)
     inverse = np.linalg.inv(covariance)
-    diagonal = np.diag(inverse)
-    residual = inverse @ model.y_train_
-    return max(1.0, float(np.sqrt(np.mean(residual**2 / diagonal))))
+    residuals: FloatArray = (inverse @ model.y_train_) / np.sqrt(np.diag(inverse))
+    return residuals
 
 
-def _correlation(scenes: Sequence[Group], features: Sequence[str]) -> FloatArray:
-    """Correlation of the features between seeds of a scene, shrunk towards independence."""
+def _correlation(residuals: FloatArray) -> FloatArray:
+    """Correlation of the features of a run about what its parameters predict.
+
+    Shrunk towards independence by as much as the number of scenes calls for (Ledoit & Wolf 2004).
+    """
     from sklearn.covariance import ledoit_wolf
 
-    rows = []
-    for group in scenes:
-        if group.n < 2:
-            continue
-        parts = [
-            features_of(Group(group.name, True, {"1": results}, group.scene), REDUCED_UNITS)
-            for results in group.trials.values()
-        ]
-        if all(f in part for part in parts for f in features):
-            block = np.array([[part[f].value for f in features] for part in parts])
-            rows.append((block - block.mean(axis=0)) * math.sqrt(len(parts) / (len(parts) - 1)))
-    if len(rows) < 2:
-        return np.eye(len(features))
-    residuals = np.vstack(rows)
-    scale = residuals.std(axis=0)
-    if not (scale > 0).all():
-        return np.eye(len(features))
-    covariance, _ = ledoit_wolf(residuals / scale)
+    covariance, _ = ledoit_wolf(residuals)
     deviation = np.sqrt(np.diag(covariance))
     correlation: FloatArray = covariance / np.outer(deviation, deviation)
     return correlation
@@ -382,7 +375,8 @@ def sensitivity(posterior: Posterior) -> dict[str, dict[str, float]]:
     """
     middle = np.array([posterior.interval(name)[1] for name in posterior.names])
     out: dict[str, dict[str, float]] = {feature: {} for feature in posterior.features}
-    deviation = np.sqrt(np.diag(posterior.target[1]))
+    _, error, shared = posterior.target
+    deviation = np.sqrt(error**2 + (shared**2).sum(axis=1))
     for i, name in enumerate(posterior.names):
         ends = np.array([middle, middle])
         ends[:, i] = posterior.bounds[name]

@@ -60,6 +60,7 @@ def scattering_figure(groups: Sequence[Group]) -> Figure | None:
     every = [curve for _, curves in sides for curve in curves]
     if not every:
         return None
+    lowest = min(float(np.nanmin(curve.y)) for curve in every)
     return _paired(
         sides,
         name="self-intermediate-scattering",
@@ -68,7 +69,7 @@ def scattering_figure(groups: Sequence[Group]) -> Figure | None:
         "τ_{α} and are left out here.",
         alt="F_s against time in units of the relaxation time",
         x=Scale("t/τ_{α}", log=True, limits=common_limits([c.x for c in every], log=True)),
-        y=Scale("F_{s}(q, t)", limits=(-0.08, 1.08)),
+        y=Scale("F_{s}(q, t)", limits=(min(-0.08, lowest - 0.02), 1.08)),
         marks=(Mark(float(np.exp(-1)), "1/e", axis="y"),),
         column="lag_over_tau_alpha",
         own_time=groups,

@@ -161,7 +161,7 @@ def map_figures(groups: Sequence[Group]) -> list[Figure]:
                     place = tensions.index(group.scene["eta"]), speeds.index(group.scene["v0"])
                     field[place], errors[place] = scalar.value, scalar.std_error
             name = f"map-{slug}-{index + 1}"
-            svg = draw_map(field, name, x=("v_{0}", speeds), y=("η", tensions), limits=limits,
+            svg = draw_map(field, name, x=("v₀", speeds), y=("η", tensions), limits=limits,
                            errors=errors)  # fmt: skip
             panels.append(
                 Panel(name, svg, f"{title} over v0 and eta at phi {phi:g}.", f"φ = {phi:g}")
@@ -227,6 +227,6 @@ def _against_packing(groups: Sequence[Group]) -> list[Curve]:
     curves = []
     for series, (key, points) in enumerate(sorted(lines.items())):
         x, y, error = (np.array(v) for v in zip(*sorted(points), strict=True))
-        label = f"v_{{0}} = {key[0]:g}, η = {key[1]:g}"
+        label = f"v₀ = {key[0]:g}, η = {key[1]:g}"
         curves.append(Curve(label, x, y, error, series, "points"))
     return curves
