@@ -132,7 +132,15 @@ def relaxation_times(tasks: Sequence[Mapping[str, Any]]) -> "pd.DataFrame | None
                 "n_windows": int(weight.sum()),
             }
         )
-    return pd.DataFrame(rows)
+    kinds = {
+        "condition": "str",
+        "trial": "str",
+        **dict.fromkeys(("bin_centre", "density", "tau_alpha", "std_error"), "float64"),
+        "censored": "bool",
+        **dict.fromkeys(("censored_at", "below"), "float64"),
+        **dict.fromkeys(("n_stacks", "n_windows"), "int64"),
+    }
+    return pd.DataFrame(rows, columns=list(kinds)).astype(kinds)
 
 
 def trial_values(stacks: "pd.DataFrame") -> "pd.DataFrame":
