@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,10 @@ class Group:
 
     def scalars(self) -> dict[str, Scalar]:
         """Every scalar by key: mean over trials, with the standard error over trials."""
+        return dict(self._scalars)
+
+    @cached_property
+    def _scalars(self) -> dict[str, Scalar]:
         per_trial = [
             _pool([{s.key: s for s in read_scalars(result)} for result in results], "recordings")
             for results in self.trials.values()
