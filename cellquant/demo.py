@@ -27,7 +27,6 @@ def demo_scene(seed: int) -> SceneConfig:
         transient=40,
         duration=200,
         save_every=2.5,
-        dt=0.02,
         seed=seed,
     )
 

@@ -145,7 +145,42 @@ def sweep(
         raise typer.Exit(2 if outcome.only_input_errors else 1)
 
 
+def convergence(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Output folder.")],
+    scene: SceneFile = None,
+    cells: Annotated[int | None, typer.Option(help="Number of cells.")] = None,
+    duration: Annotated[float, typer.Option(help="Time of the comparison, t0.")] = 4.0,
+    transient: Annotated[float, typer.Option(help="Time before it, t0.")] = 60.0,
+) -> None:
+    """Measure error against run time of contact rules, integrators and steps."""
+    from cellquant.config import SceneConfig, read_toml, validate
+    from cellquant.sim import Scene
+    from cellquant.sim import convergence as measure
+    from cellquant.storage import check_output
+
+    check_output(output)
+    content = {"cells": 144} if scene is None else read_toml(scene)
+    if cells is not None:
+        content["cells"] = cells
+    config = validate(content, SceneConfig, where=str(scene or "options"))
+    with step("convergence", unit="runs") as progress:
+        found = measure(
+            Scene.from_config(config),
+            output,
+            duration=duration,
+            transient=transient,
+            progress=progress,
+        )
+    for name, value in found.recommendation.items():
+        say(
+            f"{name.replace('_', ' ')}: {value:.4g}"
+            if isinstance(value, float)
+            else f"{name.replace('_', ' ')}: {value}"
+        )
+    note(f"wrote {output / 'convergence.parquet'}")
+
+
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
-    for command in (simulate, render, sweep):
+    for command in (simulate, render, sweep, convergence):
         app.command()(command)
