@@ -45,7 +45,8 @@ SCENES = {
     "four cells": {"n_cells": 4},
     "box of one cell width": {"n_cells": 3, "box": (1.0, 4.0)},
     "on top of each other": {"positions": ((2.0, 2.0),) * 16},
-    "almost on top": {"positions": tuple((2.0 + 1e-3 * i, 2.0) for i in range(16))},
+    "two almost on top": {"n_cells": 2, "box": (3, 3), "positions": ((1, 1), (1.001, 1))},
+    "sixteen almost on top": {"positions": tuple((2.0 + 1e-3 * i, 2.0) for i in range(16))},
     "random start": {"initial": "random"},
     "box far too small": {"n_cells": 16, "box": (2.0, 2.0)},
 }

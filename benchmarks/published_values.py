@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cellquant.observables import observe
-from cellquant.sim import Scene, simulate
+from cellquant.sim import Scene, SimulationFailure, simulate
 
 RESULTS = Path(__file__).parent / "results"
 POINTS = [
@@ -63,14 +63,19 @@ def main():
             scene = {k: v for k, v in point.items() if k != "published"}
             for seed in options.seeds:
                 name = f"{rule.split(',')[0].replace(' ', '')}_{scene['phi']}_{seed}.zarr"
-                run = simulate(
-                    Scene(n_cells=options.cells, seed=seed, **scene),
-                    duration=options.duration,
-                    transient=options.transient,
-                    save_every=options.save_every,
-                    output=options.folder / name,
-                    **settings,
-                )
+                try:
+                    run = simulate(
+                        Scene(n_cells=options.cells, seed=seed, **scene),
+                        duration=options.duration,
+                        transient=options.transient,
+                        save_every=options.save_every,
+                        output=options.folder / name,
+                        **settings,
+                    )
+                except SimulationFailure as failure:
+                    rows.append({"rule": rule, **scene, "seed": seed, "failure": str(failure)})
+                    print(rows[-1], flush=True)
+                    continue
                 rows.append({"rule": rule, **scene, "seed": seed, **measure(run)})
                 print(rows[-1], flush=True)
                 write(rows, options)
@@ -81,7 +86,9 @@ def write(rows, options):
     table = []
     for rule in RULES:
         for point in POINTS:
-            chosen = [r for r in rows if r["rule"] == rule and r["phi"] == point["phi"]]
+            chosen = [
+                r for r in rows if r["rule"] == rule and r["phi"] == point["phi"] and "p" in r
+            ]
             if not chosen:
                 continue
             entry = {"rule": rule, **point, "n_seeds": len(chosen)}

@@ -302,7 +302,8 @@ def test_rigid_discs_equal_the_general_kernel_without_shapes():
         ("eta", math.inf), ("n_cells", 0), ("n_cells", 2.5), ("polydispersity", 0.4),
         ("D_r", -1e-9), ("mu_r", 0.0), ("modes", 0), ("modes", 99), ("initial", "square"),
         ("box", (1.0, 0.0)), ("box", (3.0, 3.0)), ("seed", -1), ("radii", (0.5,)),
-        ("positions", ((0.0, math.nan),) * 1024), ("aspect", 0.0), ("phi", "dense"),
+        ("positions", ((0.0, math.nan),) * 1024), ("positions", ((1.0, 1.0),) * 1024),
+        ("aspect", 0.0), ("phi", "dense"),
     ],
 )  # fmt: skip
 def test_impossible_scenes_are_refused_by_field(field, value):
@@ -311,7 +312,7 @@ def test_impossible_scenes_are_refused_by_field(field, value):
 
 
 def test_scene_survives_its_dictionary():
-    scene = Scene(n_cells=2, radii=np.array([0.5, 0.4]), box=(4, 5), positions=np.ones((2, 2)))
+    scene = Scene(n_cells=2, radii=np.array([0.5, 0.4]), box=(4, 5), positions=np.eye(2))
     assert Scene.from_dict(scene.to_dict()) == scene
     assert hash(scene) == hash(scene.replace())
 

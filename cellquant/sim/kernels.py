@@ -30,6 +30,7 @@ ROW = np.uint64(CHUNK)  # unsigned, as every index of a vector loop: a sign woul
 HEAD = 4  # entries of a record before the modes
 ROOT = 6  # entries of a root: unit vector on i, unit vector on j, rho on i, rho on j
 HULL_MARGIN = 1e-4  # of the cubic through two samples, relative to A0
+SMOOTH = 3.5  # sum n^2 |C_n| / A0 above which a contour's length takes twice the points
 MOST_LOOKS = 400  # closer looks at one pair; only nearly coincident contours need more
 OVERFLOW = 1  # more crossings than the buffer holds
 
@@ -155,10 +156,6 @@ def contours(
         odd = np.zeros(half)
         even_slope = np.zeros(half)
         odd_slope = np.zeros(half)
-        between = np.empty((2, len(modes)))
-        for m in range(len(modes)):
-            between[0, m] = math.cos(0.5 * (m + 2) * spacing)
-            between[1, m] = math.sin(0.5 * (m + 2) * spacing)
         for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
             r0 = radius[i]
             power = 0.0
@@ -210,11 +207,17 @@ def contours(
             lowest[i] = low if power < 2.0 else math.nan
             if len(tension) > 0:
                 tangent[i, :] = 0.0
-                # The length needs twice the points: the samples, then those half-way between.
-                for grid in range(2):
+                # The length needs more points: those of one or three turned grids as well.
+                n_grids = 2 if bend < SMOOTH * mean else 4
+                share = spacing / n_grids
+                for grid in range(n_grids):
+                    turn_c = math.cos(grid * share)
+                    turn_s = math.sin(grid * share)
                     length = 0.0
                     constant = 0.0
-                    if grid == 1:
+                    if grid > 0:
+                        c_n = turn_c
+                        s_n = turn_s
                         for s in range(half):
                             even[s] = 0.0
                             odd[s] = 0.0
@@ -224,10 +227,8 @@ def contours(
                             n = m + 2
                             re = record[i, HEAD + m]
                             im = record[i, HEAD + len(modes) + m]
-                            re, im = (
-                                re * between[0, m] - im * between[1, m],
-                                re * between[1, m] + im * between[0, m],
-                            )
+                            c_n, s_n = c_n * turn_c - s_n * turn_s, s_n * turn_c + c_n * turn_s
+                            re, im = re * c_n - im * s_n, re * s_n + im * c_n
                             if n % 2 == 0:
                                 for s in range(half):
                                     c = table[2 * m + 2, s]
@@ -259,8 +260,10 @@ def contours(
                         odd[s] = u - u_half
                         even_slope[s] = v + v_half
                         odd_slope[s] = v - v_half
-                    tangent[i, 0] += 0.5 * spacing * length
-                    tangent[i, 1] += 0.5 * spacing * constant
+                    tangent[i, 0] += share * length
+                    tangent[i, 1] += share * constant
+                    c_n = turn_c
+                    s_n = turn_s
                     for m in range(len(modes)):
                         n = m + 2
                         re = 0.0
@@ -277,13 +280,9 @@ def contours(
                                 d = table[2 * m + 3, s]
                                 re += odd[s] * c - n * odd_slope[s] * d
                                 im += odd[s] * d + n * odd_slope[s] * c
-                        if grid == 1:
-                            re, im = (
-                                re * between[0, m] - im * between[1, m],
-                                re * between[1, m] + im * between[0, m],
-                            )
-                        tangent[i, 2 + m] += 0.5 * spacing * re
-                        tangent[i, 2 + len(modes) + m] += 0.5 * spacing * im
+                        c_n, s_n = c_n * turn_c - s_n * turn_s, s_n * turn_c + c_n * turn_s
+                        tangent[i, 2 + m] += share * (re * c_n - im * s_n)
+                        tangent[i, 2 + len(modes) + m] += share * (re * s_n + im * c_n)
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")

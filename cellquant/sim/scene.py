@@ -154,6 +154,11 @@ class Scene:
                     raise InputError(
                         f"positions must be rows of two finite numbers, got {row}; correct it."
                     )
+            if len(set(self.positions)) < self.n_cells:
+                raise InputError(
+                    "positions puts two cells on the same point, from where no direction of push "
+                    "is defined; move one of them."
+                )
         if self.polarities is not None:
             _length("polarities", self.polarities, self.n_cells)
             for angle in self.polarities:

@@ -159,8 +159,10 @@ def _integrate(
 ) -> tuple[Floats, float]:
     method = METHODS[name].make(layer)
     w, area = tree.level(root, depth)
-    state = start.copy()
     h = tree.span / 2**depth
+    method.step(start.copy(), h, w[0], area[0])  # loads what is compiled, makes the lists
+    state = start.copy()
+    layer.evaluations = 0
     begin = time.process_time()
     for index in range(2**depth):
         method.step(state, h, w[index], area[index])
