@@ -325,7 +325,7 @@ def intact_f1(
 
 def speed() -> list[dict]:
     lines = []
-    for n_cells, n_frames in ((1300, 20), (1300, 40), (5200, 10)):
+    for n_cells, n_frames in ((1300, 20), (1300, 40), (1300, 80)):
         layer = voronoi_layer(n_cells, n_frames, step=0.15)
         new, _ = shuffled(layer.masks)
         labels = LabelStack.from_array(new, units="pixel")
@@ -337,6 +337,8 @@ def speed() -> list[dict]:
             "centroids": lambda c=cells: track_cells(c),
             "laptrack": lambda c=cells, s=spacing: laptrack_table(c, 0.7 * s),
         }
+        if n_frames > 20:
+            del makers["laptrack"], runs["laptrack"]  # its ratio is known from the short movie
         for make in makers.values():
             make()
         for _ in range(3):
@@ -348,7 +350,8 @@ def speed() -> list[dict]:
         for tool, values in runs.items():
             line[f"{tool}_cpu_s"] = float(np.median(values))
             line[f"{tool}_spread_s"] = float(np.ptp(values))
-        line["ratio_laptrack_over_centroids"] = line["laptrack_cpu_s"] / line["centroids_cpu_s"]
+        peer = line.get("laptrack_cpu_s", float("nan"))
+        line["ratio_laptrack_over_centroids"] = peer / line["centroids_cpu_s"]
         lines.append(line)
         show(line)
     return lines
@@ -388,7 +391,8 @@ def report() -> None:
         keys = list(lines[0])
         text += ["", f"## {title}", "", "| " + " | ".join(keys) + " |", "|---" * len(keys) + "|"]
         for line in lines:
-            cells = [f"{v:.4f}" if isinstance(v, float) else str(v) for v in line.values()]
+            values = [line.get(key, float("nan")) for key in keys]
+            cells = [f"{v:.4f}" if isinstance(v, float) else str(v) for v in values]
             text.append("| " + " | ".join(cells).replace("nan", "none") + " |")
     target = Path(__file__).resolve().parents[1] / "docs" / "accuracy_tracking.md"
     target.write_text("\n".join(text) + "\n")
