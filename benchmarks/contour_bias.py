@@ -14,6 +14,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from skimage.measure import regionprops_table
+
+from cellquant.segment import measure_frame
 from contour_scenes import (
     SHAPES,
     Scene,
@@ -23,9 +26,6 @@ from contour_scenes import (
     packing,
     tissue,
 )
-from skimage.measure import regionprops_table
-
-from cellquant.segment import measure_frame
 
 try:
     import diplib

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from layers import data_folder, shuffled, voronoi_layer
 
 from cellquant.io import LabelStack, read_labels
 from cellquant.segment import measure_cells
@@ -24,6 +23,7 @@ from cellquant.track import track_cells
 from cellquant.track.evaluate import Scores, edges, read_truth, score_tables
 from cellquant.track.movie import flatten
 from cellquant.track.solve import Options, solve
+from layers import data_folder, shuffled, voronoi_layer
 
 RESULTS = Path(__file__).parent / "results"
 SETS = (("epidermis_area1", 1), ("cell_migration", 1), ("cell_migration", 3), ("cell_migration", 7))

@@ -221,7 +221,10 @@ def _observables(
             "quantiles": {q: 3.6 + f * 3 for q, f in _QUANTILES.items()},
         },
         "wave_number": {
-            "q": 2 * np.pi / diameter, "rule": "2pi/d", "mean_diameter": diameter, "mean_diameter_std_error": 0.004 * diameter,
+            "q": 2 * np.pi / diameter,
+            "rule": "2pi/d",
+            "mean_diameter": diameter,
+            "mean_diameter_std_error": 0.004 * diameter,
             "q_peak": 6.1 / diameter,
         },
         "tau_alpha": {"value": tau, "std_error": 0.06 * tau, "censored_at": None},

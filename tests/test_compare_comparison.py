@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compare_examples import make_layer
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,6 +23,7 @@ from cellquant.compare.comparison import (
 from cellquant.compare.groups import read_groups
 from cellquant.compare.units import STERIC_AREA
 from cellquant.errors import InputError
+from compare_examples import make_layer
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from urllib.parse import unquote
 import numpy as np
 import pandas as pd
 import pytest
-from compare_examples import Layer, Stack, make_layer
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,6 +21,7 @@ from cellquant.compare.results import Result, read_result, read_scalars, unit_te
 from cellquant.compare.svg import THEME, compact_path
 from cellquant.errors import InputError
 from cellquant.tables import PHYSICAL, REDUCED
+from compare_examples import Layer, Stack, make_layer
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-from observables_examples import brownian, persistent, tracks_of
 from scipy import stats
 
 from cellquant.observables.correlations import persistence_time, velocity_autocorrelation
@@ -19,6 +18,7 @@ from cellquant.observables.relaxation import relaxation_time
 from cellquant.observables.structure import structure_factor
 from cellquant.observables.trajectories import from_tracks
 from cellquant.observables.vanhove import self_van_hove
+from observables_examples import brownian, persistent, tracks_of
 
 N_BLOCKS = 16  # of 64 to 399 tracks
 

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import get_num_threads, set_num_threads
-from observables_examples import brownian, tracks_of, with_gaps
 from scipy.special import j0, jv
 
 from cellquant.observables import kernels
@@ -20,6 +19,7 @@ from cellquant.observables.dynamics import (
 )
 from cellquant.observables.trajectories import from_tracks, log_lags
 from cellquant.tables import Tracks
+from observables_examples import brownian, tracks_of, with_gaps
 
 LAGS = np.array([1, 2, 5, 9])
 

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from observables_examples import brownian, movie, tracks_of, with_gaps
 
 from cellquant.errors import InputError
 from cellquant.observables import available_observables, needs_tracks, observe
 from cellquant.tables import PHYSICAL, PIXEL, Cells, Tracks
+from observables_examples import brownian, movie, tracks_of, with_gaps
 
 TABLES = {
     "self_intermediate_scattering": ("lag_time", "value", "std_error", "n_pairs", "window"),

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from observables_examples import brownian
 
 from cellquant.observables.dynamics import LagAverage, scattering_average
 from cellquant.observables.fits import fit_stretched_exponential
 from cellquant.observables.relaxation import crossing_time, relaxation_time
+from observables_examples import brownian
 
 
 def curve(value: np.ndarray, lag_time: np.ndarray, spread: float = 0.0) -> LagAverage:

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from observables_examples import tracks_of
 from scipy import stats
 
 from cellquant.observables import observe
 from cellquant.observables.blocks import Blocks, spatial_blocks
 from cellquant.observables.shape import describe
+from observables_examples import tracks_of
 
 
 def blocks_of(n: int, n_blocks: int = 16) -> Blocks:

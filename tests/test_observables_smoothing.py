@@ -5,11 +5,11 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from observables_examples import brownian, tracks_of, with_gaps
 
 from cellquant.errors import InputError
 from cellquant.observables import remove_drift, retain, smooth_tracks
 from cellquant.tables import Tracks
+from observables_examples import brownian, tracks_of, with_gaps
 
 
 def naive_average(x: np.ndarray, half: int) -> np.ndarray:

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from observables_examples import brownian, tracks_of
 
 from cellquant.observables.bonds import bond_order, neighbour_pairs
 from cellquant.observables.structure import pair_correlation, structure_factor
+from observables_examples import brownian, tracks_of
 
 BOX = (10.0, 8.0)
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from observables_examples import brownian, tracks_of
 
 from cellquant.observables.trajectories import Trajectories, from_tracks
 from cellquant.observables.vanhove import displacements, self_van_hove
+from observables_examples import brownian, tracks_of
 
 
 def jumps(r: np.ndarray, rng: np.random.Generator) -> Trajectories:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from observables_examples import brownian, persistent, tracks_of, with_gaps
 
 from cellquant.observables.bonds import neighbour_pairs
 from cellquant.observables.correlations import (
@@ -14,6 +13,7 @@ from cellquant.observables.correlations import (
 from cellquant.observables.dynamics import displacement_moments, mean_square_displacement
 from cellquant.observables.motion import growth_exponent, speeds
 from cellquant.observables.trajectories import from_tracks
+from observables_examples import brownian, persistent, tracks_of, with_gaps
 
 
 def test_speeds_are_those_of_consecutive_frames() -> None:

@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 import numpy as np
 import pandas as pd
 import pytest
-from compare_examples import Stack, make_layer
 
 import cellquant as cq
 from cellquant.compare.report import experiment_report
+from compare_examples import Stack, make_layer
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 axe_core = pytest.importorskip(
