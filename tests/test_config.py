@@ -25,6 +25,13 @@ def test_templates_are_valid(kind: str) -> None:
     validate(tomllib.loads(TEMPLATES[kind]), MODELS[kind], where=kind)
 
 
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_examples_are_the_templates(kind: str) -> None:
+    path = Path(__file__).resolve().parents[1] / "examples" / f"{kind}.toml"
+    load(path, MODELS[kind])
+    assert path.read_text(encoding="utf-8") == TEMPLATES[kind]
+
+
 def test_grid_times_seeds() -> None:
     sweep = SweepConfig.model_validate(
         {"seeds": [1, 2], "scene": {"cells": 64}, "grid": {"phi": [0.9, 1.0], "v0": [0.01]}}
