@@ -39,7 +39,7 @@ def measure(run):
         "p_drift": float(series[half:].mean() - series[:half].mean()),
         "cpu_seconds": run.work["cpu_seconds"],
     }
-    summary = observe(run.to_tracks(), only=["relaxation_time", "van_hove"]).summary
+    summary = observe(run.to_tracks(), only=["tau_alpha", "van_hove"]).summary
     hove = summary.get("van_hove") or {}
     return found | {
         "tau_alpha": summary["tau_alpha"]["value"],
