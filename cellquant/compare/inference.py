@@ -11,6 +11,7 @@ from cellquant.compare.ranking import REDUCED_UNITS, Units, common_features, fea
 from cellquant.errors import InputError
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+FACTORS = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0)
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Posterior:
     emulator
         What the likelihood was computed with.
     target
-        Features of the target, their own errors, and the errors that they share.
+        Features of the target, their own errors, the errors that they share, and whether they
+        come from a single recording.
     """
 
     names: tuple[str, ...]
@@ -41,7 +43,7 @@ class Posterior:
     features: tuple[str, ...]
     bounds: Mapping[str, tuple[float, float]]
     emulator: "Emulator"
-    target: tuple[FloatArray, FloatArray, FloatArray]
+    target: tuple[FloatArray, FloatArray, FloatArray, bool]
 
     def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
         """Low end, median and high end of the central interval of one parameter."""
@@ -73,6 +75,11 @@ class Emulator:
         Parameters and features.
     models
         One process per feature.
+    error_law
+        (1 + parameters, features) logarithm of the error of a run as a linear function.
+    scatter
+        Factor by which each feature scatters between runs more than the error estimated inside
+        a single one says.
     widen
         Factor >= 1 on the error of each, from predicting every scene without itself.
     low, high
@@ -84,6 +91,8 @@ class Emulator:
     names: tuple[str, ...]
     features: tuple[str, ...]
     models: tuple[Any, ...]
+    error_law: FloatArray
+    scatter: FloatArray
     widen: FloatArray
     low: FloatArray
     high: FloatArray
@@ -96,8 +105,24 @@ class Emulator:
         deviation = np.column_stack([p[1] for p in pairs]) * self.widen
         return np.column_stack([p[0] for p in pairs]), deviation
 
+    def single_run_error(self, points: FloatArray, error: FloatArray) -> FloatArray:
+        """Errors (n, features) of one recording: its scatter between recordings included.
+
+        The errors that it gives are noisy. Their common size is kept; which feature is known
+        better than which follows from the scenes.
+        """
+        law = _with_constant(_scaled(points, self.low, self.high)) @ self.error_law
+        size = (np.log(error) - law).mean(axis=1, keepdims=True)
+        out: FloatArray = self.scatter * np.exp(law + size)
+        return out
+
     def log_likelihood(
-        self, points: FloatArray, value: FloatArray, error: FloatArray, shared: FloatArray
+        self,
+        points: FloatArray,
+        value: FloatArray,
+        error: FloatArray,
+        shared: FloatArray,
+        single: bool,
     ) -> FloatArray:
         """Logarithm of the probability of the observed features at each point.
 
@@ -109,9 +134,11 @@ class Emulator:
             (features,) observed, with the errors that belong to each alone.
         shared
             (features, sources) errors that several features have in common.
+        single
+            The errors were estimated inside one recording.
         """
         mean, deviation = self.predict(points)
-        spread = np.hypot(deviation, error)
+        spread = np.hypot(deviation, self.single_run_error(points, error) if single else error)
         total = self.correlation * spread[:, :, None] * spread[:, None, :] + shared @ shared.T
         diagonal = np.arange(len(value))
         factor = np.linalg.cholesky(total)
@@ -121,7 +148,7 @@ class Emulator:
         return out
 
 
-def train(candidates: Sequence[Group], features: Sequence[str], *, seed: int = 0) -> Emulator:
+def train(candidates: Sequence[Group], features: Sequence[str]) -> Emulator:
     """Fit a Gaussian process per feature to the scenes of a sweep, each with its own error.
 
     Parameters
@@ -130,8 +157,6 @@ def train(candidates: Sequence[Group], features: Sequence[str], *, seed: int = 0
         Simulated scenes; those without known phi, v0 and eta, or without a feature, are left out.
     features
         Names of the features.
-    seed
-        Seed of the optimiser's restarts.
 
     Raises
     ------
@@ -160,13 +185,26 @@ def train(candidates: Sequence[Group], features: Sequence[str], *, seed: int = 0
     errors = np.array([[table[f].std_error for f in features] for _, table in known])
     scaled = _scaled(points, low, high)
     with threadpool_limits(1):
-        models = tuple(
-            _gaussian_process(scaled, values[:, i], errors[:, i], seed)
-            for i in range(len(features))
-        )
+        # The errors of single runs scatter themselves: log-linear functions take their place.
+        error_law = np.linalg.lstsq(_with_constant(scaled), np.log(errors), rcond=None)[0]
+        smooth = np.exp(_with_constant(scaled) @ error_law)
+        fitted = [
+            _gaussian_process(scaled, values[:, i], smooth[:, i]) for i in range(len(features))
+        ]
+    models, factors = zip(*fitted, strict=True)
     residuals = np.column_stack([_left_out_residuals(model) for model in models])
     widen = np.maximum(1.0, np.sqrt((residuals**2).mean(axis=0)))
-    return Emulator(names, tuple(features), models, widen, low, high, _correlation(residuals))
+    return Emulator(
+        names,
+        tuple(features),
+        models,
+        error_law,
+        np.array(factors),
+        widen,
+        low,
+        high,
+        _correlation(residuals),
+    )
 
 
 def fit_parameters(
@@ -183,7 +221,9 @@ def fit_parameters(
     A Gaussian process per feature (anisotropic squared exponential plus a linear trend,
     scikit-learn) is fitted to the scenes; the likelihood of the target's features is Gaussian
     with the errors of target and emulator, correlated as the scenes scatter about the emulator.
-    The prior is flat over the range of the sweep: nothing is said beyond it.
+    The error of a single run or recording says nothing of the scatter between runs, so it is
+    widened by the factor by which the scenes scatter more than they say. The prior is flat over
+    the range of the sweep: nothing is said beyond it.
 
     Parameters
     ----------
@@ -214,7 +254,7 @@ def fit_parameters(
     from threadpoolctl import threadpool_limits
 
     if emulator is None:
-        emulator = train(candidates, common_features(target, candidates, units)[0], seed=seed)
+        emulator = train(candidates, common_features(target, candidates, units)[0])
     ours = features_of(target, units)
     absent = [name for name in emulator.features if name not in ours]
     if absent:
@@ -224,12 +264,13 @@ def fit_parameters(
         )
     value = np.array([ours[f].value for f in emulator.features])
     error = np.array([ours[f].own_error for f in emulator.features])
+    single = target.n == 1
     shared = np.array([ours[f].unit_error for f in emulator.features])
     low, high = emulator.low, emulator.high
     start = low + qmc.Sobol(len(low), seed=seed).random(n_points) * (high - low)
     with threadpool_limits(1):  # the matrices are too small for more to pay
         samples, density = _sample(
-            lambda points: emulator.log_likelihood(points, value, error, shared),
+            lambda points: emulator.log_likelihood(points, value, error, shared, single),
             start,
             low,
             high,
@@ -243,7 +284,7 @@ def fit_parameters(
         emulator.features,
         bounds,
         emulator,
-        (value, error, shared),
+        (value, error, shared, single),
     )
 
 
@@ -300,31 +341,38 @@ def _next_step(density: FloatArray, largest: float, effective: float) -> float:
     return max(low, 1e-9)
 
 
-def _gaussian_process(x: FloatArray, y: FloatArray, error: FloatArray, seed: int) -> Any:
+def _gaussian_process(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[Any, float]:
+    """Fit a process to a feature, and the factor by which runs scatter more than their errors say.
+
+    The factor is that of the largest marginal likelihood.
+    """
     import warnings
 
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
 
     spread = float(y.std()) or 1.0
-    smooth = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.full(x.shape[1], 1.0), (0.15, 20.0))
-    trend = ConstantKernel(1.0, (1e-3, 1e3)) * DotProduct(1.0, (1e-2, 1e2))
-    # Runs scatter more than the error estimated inside each: the white part, which the process
-    # also predicts for the run that it is asked about.
-    scatter = WhiteKernel(1e-3, (1e-7, 1.0))
-    kernel = smooth + trend + scatter
-    model = GaussianProcessRegressor(
-        kernel,
-        alpha=(error / spread) ** 2 + 1e-6,
-        normalize_y=True,
-        n_restarts_optimizer=2,
-        random_state=seed,
-    )
-    with warnings.catch_warnings():
-        # A length scale at its bound means that the feature does not depend on that parameter.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return model.fit(x, y)
+    best: tuple[Any, float] | None = None
+    for factor in FACTORS:
+        smooth = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.full(x.shape[1], 1.0), (0.15, 20.0))
+        trend = ConstantKernel(1.0, (1e-3, 1e3)) * DotProduct(1.0, (1e-2, 1e2))
+        model = GaussianProcessRegressor(
+            smooth + trend, alpha=(factor * error / spread) ** 2 + 1e-6, normalize_y=True
+        )
+        with warnings.catch_warnings():
+            # A length scale at its bound: the feature does not depend on that parameter.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            model.fit(x, y)
+        likelihood = model.log_marginal_likelihood_value_
+        if best is None or likelihood > best[0].log_marginal_likelihood_value_:
+            best = model, factor
+    assert best is not None
+    return best
+
+
+def _with_constant(x: FloatArray) -> FloatArray:
+    return np.column_stack([np.ones(len(x)), x])
 
 
 def _scaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
@@ -375,7 +423,9 @@ def sensitivity(posterior: Posterior) -> dict[str, dict[str, float]]:
     """
     middle = np.array([posterior.interval(name)[1] for name in posterior.names])
     out: dict[str, dict[str, float]] = {feature: {} for feature in posterior.features}
-    _, error, shared = posterior.target
+    _, error, shared, single = posterior.target
+    if single:
+        error = posterior.emulator.single_run_error(middle[None], error)[0]
     deviation = np.sqrt(error**2 + (shared**2).sum(axis=1))
     for i, name in enumerate(posterior.names):
         ends = np.array([middle, middle])
