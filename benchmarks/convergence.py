@@ -1,6 +1,7 @@
 """Error against run time on the reference scene, three seeds; writes the figure for the docs."""
 
 import json
+import shutil
 from pathlib import Path
 
 from cellquant.sim import Scene, convergence
@@ -22,6 +23,7 @@ def main():
     images = DOCS / "images"
     images.mkdir(exist_ok=True)
     (RESULTS / "convergence" / "convergence.svg").replace(images / "convergence.svg")
+    shutil.rmtree(RESULTS / "convergence")
 
 
 if __name__ == "__main__":
