@@ -6,12 +6,14 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 SHARED = {"run_all.py", "synthetic_layer.py"}
+LONG = {"published_values.py"}  # hours; run it by hand, it resumes
+REPORTS = {"simulation_report.py"}  # written from the results of the others
 
 
 def main() -> None:
     failed = []
-    for script in sorted(HERE.glob("*.py")):
-        if script.name in SHARED or "__main__" not in script.read_text(encoding="utf-8"):
+    for script in sorted(HERE.glob("*.py"), key=lambda path: (path.name in REPORTS, path.name)):
+        if script.name in SHARED | LONG or "__main__" not in script.read_text(encoding="utf-8"):
             continue
         print(f"== {script.name}", flush=True)
         if subprocess.run([sys.executable, str(script)], cwd=HERE, check=False).returncode:

@@ -21,6 +21,8 @@ _HOMES = {
     "observe": "cellquant.observables",
     "Scene": "cellquant.sim",
     "simulate": "cellquant.sim",
+    "open_run": "cellquant.sim",
+    "render": "cellquant.sim",
     "compare": "cellquant.compare",
 }
 
