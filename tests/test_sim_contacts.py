@@ -54,10 +54,11 @@ def lively(scene, spread=0.05, seed=0):
 
 def pair(distance, shapes=((), ()), radii=(0.5, 0.5), modes=6, box=(10.0, 10.0), **changes):
     scene = Scene(
-        n_cells=2, box=box, modes=modes, radii=radii, positions=((5, 5), (5 + distance, 5)),
+        n_cells=2, box=box, modes=modes, radii=radii, positions=((5, 5), (5 + (distance or 1), 5)),
         polarities=(0.3, 1.1), **{**FREE, **changes},
     )  # fmt: skip
     state, radius, edges = initial_state(scene)
+    state[1, 0] = state[0, 0] + distance  # a scene refuses concentric cells; forces must not
     for row, shape in zip(state, shapes, strict=True):
         for mode, a, b in shape:
             row[1 + mode], row[modes + mode] = a, b
