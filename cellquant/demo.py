@@ -119,7 +119,9 @@ def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
                     row["quantity"],
                     format_value(row["truth"], row["truth_std_error"]),
                     format_value(row["measured"], row["measured_std_error"]),
-                    "" if row["unit"] == "1" else pretty_unit(row["unit"]),
+                    ""
+                    if row["unit"] == "1"
+                    else "/".join(map(pretty_unit, row["unit"].split("/"))),
                     *("not known" if isnan(e) else f"{100 * e:+.2f} %" for e in errors),
                 ),
                 "none" if isnan(errors[0]) else "",

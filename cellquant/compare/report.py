@@ -251,6 +251,12 @@ def _censored_rule(scalar: Scalar) -> str:
     return f"{scalar.rule}; the curve does not cross within the recording, so this is a bound"
 
 
+def _counted(words: str, count: int) -> str:
+    """The words with their leading plural noun in the singular where there is one."""
+    noun, _, rest = words.partition(" ")
+    return f"{noun.removesuffix('s')} {rest}".rstrip() if count == 1 else words
+
+
 def warnings_section(
     faults: Mapping[str, int],
     settings: Mapping[str, Any],
@@ -259,7 +265,7 @@ def warnings_section(
 ) -> Section:
     """What a reader should know before trusting the numbers."""
     points = [
-        f"{count} {_FAULTS.get(name, name.replace('_', ' '))}."
+        f"{count} {_counted(_FAULTS.get(name, name.replace('_', ' ')), count)}."
         for name, count in faults.items()
         if count
     ]
