@@ -19,7 +19,8 @@ def with_error(value: float | None, std_error: float | None, unit: str = "") -> 
     suffix = f" {unit}" if unit else ""
     if value is None or not isfinite(value):
         return "not measurable"
-    if not std_error or not isfinite(std_error):
+    # An error at the level of round-off is none.
+    if not std_error or not isfinite(std_error) or std_error <= 1e-12 * abs(value):
         return f"{value:.4g}{suffix}"
     digits = max(0, 1 - floor(log10(abs(std_error))))
     return f"{value:.{digits}f} ± {std_error:.{digits}f}{suffix}"
