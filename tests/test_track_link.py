@@ -323,3 +323,24 @@ def test_real_recordings_with_shuffled_labels(
     assert scores.edge_f1 >= edge
     assert scores.division_f1 >= division
     assert scores.idf1 >= idf1
+
+
+def test_large_tangles_are_solved_by_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bounded way uses no cell twice and comes close to the integer program."""
+    rng = np.random.default_rng(4)
+    rows, columns = np.indices((30, 40)).reshape(2, -1)
+    gains = rng.normal(size=rows.size)
+    families = np.column_stack(
+        (rng.integers(0, 30, 60), [rng.choice(40, 2, replace=False) for _ in range(60)])
+    )
+    odds = rng.normal(2.0, 2.0, 60)
+    worth = []
+    for limit in (4000, 10):
+        monkeypatch.setattr("cellquant.track.assign.PROGRAM_LIMIT", limit)
+        links, split = match_with_divisions(rows, columns, gains, families, odds)
+        mothers = np.concatenate((rows[links], families[split, 0]))
+        daughters = np.concatenate((columns[links], families[split, 1:].reshape(-1)))
+        assert len(set(mothers)) == len(mothers)
+        assert len(set(daughters)) == len(daughters)
+        worth.append(gains[links].sum() + odds[split].sum())
+    assert 0.9 * worth[0] <= worth[1] <= worth[0] + 1e-9

@@ -5,10 +5,11 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
 
-from cellquant.track.movie import FloatArray, IntArray
+from cellquant.track.movie import BoolArray, FloatArray, IntArray
 
 # Beyond this many branches the best division set found so far is kept: a bound, not a tuning knob.
 BRANCH_LIMIT = 200
+PROGRAM_LIMIT = 4000  # options of one program; larger tangles are solved by exchange
 
 
 def match(rows: IntArray, columns: IntArray, gains: FloatArray) -> IntArray:
@@ -82,8 +83,9 @@ def match_with_divisions(
     divisions : numpy.ndarray
         Indices of the chosen divisions.
 
-    The part of the problem that a division can influence is a small integer program, the rest is
-    an assignment.
+    The parts of the problem that a division can influence are small integer programs, the rest is
+    an assignment. A part too large for a program is solved approximately, so that no input can
+    make the cost explode.
     """
     none = np.empty(0, dtype=np.int64)
     if len(families) == 0:
@@ -110,24 +112,78 @@ def match_with_divisions(
     divided[component[mother]] = True
     inside = np.flatnonzero(divided[component[row[:e]]] & (gains > 0.0))
     outside = np.flatnonzero(~divided[component[row[:e]]])
-    alone = outside[match(rows[outside], columns[outside], gains[outside])]
-    cells = np.concatenate(
-        (row[inside], n + column[inside], mother, n + daughters[0], n + daughters[1])
-    )
-    option = np.arange(len(inside) + d)
-    options = np.concatenate((option[: len(inside)],) * 2 + (option[len(inside) :],) * 3)
+    chosen = [outside[match(rows[outside], columns[outside], gains[outside])]]
+    split = []
+    link_part, family_part = component[row[inside]], component[mother]
+    for parts in _blocks(np.bincount(np.concatenate((link_part, family_part)))):
+        one = inside[parts[link_part]]
+        other = np.flatnonzero(parts[family_part])
+        solve = _program if len(one) + len(other) <= PROGRAM_LIMIT else _exchange
+        links, divisions = solve(
+            row[one],
+            n + column[one],
+            gains[one],
+            np.column_stack((mother, n + daughters[0], n + daughters[1]))[other],
+            family_gains[other],
+        )
+        chosen.append(one[links])
+        split.append(other[divisions])
+    return np.sort(np.concatenate(chosen)), np.sort(np.concatenate(split))
+
+
+def _blocks(sizes: IntArray) -> list[BoolArray]:
+    """Components put together into programs of up to `PROGRAM_LIMIT` options, as masks."""
+    blocks: list[BoolArray] = []
+    filled = PROGRAM_LIMIT + 1
+    for part in np.flatnonzero(sizes):
+        if filled + sizes[part] > PROGRAM_LIMIT:
+            blocks.append(np.zeros(len(sizes), dtype=bool))
+            filled = 0
+        blocks[-1][part] = True
+        filled += int(sizes[part])
+    return blocks
+
+
+def _program(
+    rows: IntArray, columns: IntArray, gains: FloatArray, families: IntArray, odds: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Best links and divisions by an integer program; every cell has one number."""
+    e, d = len(rows), len(families)
+    cells = np.concatenate((rows, columns, families.T.reshape(-1)))
+    options = np.concatenate((np.tile(np.arange(e), 2), np.tile(e + np.arange(d), 3)))
     used, constraint = np.unique(cells, return_inverse=True)
-    usage = csr_array((np.ones(len(cells)), (constraint, options)), shape=(len(used), len(option)))
+    usage = csr_array((np.ones(len(cells)), (constraint, options)), shape=(len(used), e + d))
     solution = milp(
-        -np.concatenate((gains[inside], family_gains)),
-        integrality=np.ones(len(option)),
+        -np.concatenate((gains, odds)),
+        integrality=np.ones(e + d),
         bounds=Bounds(0.0, 1.0),
         constraints=LinearConstraint(usage, -np.inf, 1.0),
         options={"node_limit": BRANCH_LIMIT},
     )
     if solution.x is None:
-        chosen = match(rows[inside], columns[inside], gains[inside])
-        return np.sort(np.concatenate((alone, inside[chosen]))), none
+        return _exchange(rows, columns, gains, families, odds)
     taken = solution.x > 0.5
-    links = np.sort(np.concatenate((alone, inside[taken[: len(inside)]])))
-    return links, np.flatnonzero(taken[len(inside) :])
+    return np.flatnonzero(taken[:e]), np.flatnonzero(taken[e:])
+
+
+def _exchange(
+    rows: IntArray, columns: IntArray, gains: FloatArray, families: IntArray, odds: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Links first, then divisions that are worth more than the links they break, best first."""
+    chosen = match(rows, columns, gains)
+    held = np.zeros(int(max(rows.max(initial=0), columns.max(initial=0), families.max())) + 1)
+    held[rows[chosen]] = held[columns[chosen]] = gains[chosen]
+    partner = np.full(len(held), -1)
+    partner[rows[chosen]], partner[columns[chosen]] = columns[chosen], rows[chosen]
+    lost = held[families].sum(axis=1)
+    for child in (1, 2):
+        lost -= np.where(partner[families[:, 0]] == families[:, child], held[families[:, child]], 0)
+    free = np.ones(len(held), dtype=bool)
+    taken = []
+    for index in np.argsort(lost - odds, kind="stable").tolist():
+        if odds[index] > lost[index] and free[families[index]].all():
+            free[families[index]] = False
+            taken.append(index)
+    rest = np.flatnonzero(free[rows] & free[columns])
+    links = rest[match(rows[rest], columns[rest], gains[rest])]
+    return links, np.array(sorted(taken), dtype=np.int64)
