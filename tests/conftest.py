@@ -4,6 +4,13 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The quick profile draws the same examples in every run; the thorough one draws new ones:
+# HYPOTHESIS_PROFILE=thorough make test
+settings.register_profile("quick", derandomize=True)
+settings.register_profile("thorough", max_examples=500, deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
