@@ -9,7 +9,7 @@ from cellquant.track.movie import FloatArray, IntArray, Movie
 
 CANDIDATES = 10  # nearest cells around the predicted place that are considered at all
 _WIDTHS = (0.6, 0.2)  # of the soft assignment, first and last, in units of the spacing
-_STEPS = 12
+_STEPS = 8
 _OUTLIER = 0.1
 _VOTERS = 2000
 _ENOUGH_MATCHED = 0.75

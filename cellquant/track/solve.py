@@ -42,7 +42,7 @@ _SURE = 0.99  # a cell whose mother is known with this probability needs no divi
 _DIVISION_PASS = 1  # the first pass that looks for divisions
 _IMAGE_PASS = 2  # the first pass that looks at the images
 _SETTLED = 0.999  # cells whose partner is known with this probability need no image
-_CALIBRATION_CELLS = 4000  # compared in any case, to learn what images tell
+_CALIBRATION_CELLS = 2000  # compared in any case, to learn what images tell
 
 
 @dataclass(frozen=True)
