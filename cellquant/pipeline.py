@@ -157,18 +157,21 @@ def simulate_scene(config: "SceneConfig", out: str | Path | None, *, step: Step 
 def open_source(
     source: str | Path,
     *,
-    shapes_only: bool = False,
+    only: Sequence[str] | None = None,
     calibration: Mapping[str, Any] | None = None,
     step: Step = silent,
 ) -> "Tracks | Cells | Any":
     """Open what can be observed: tracks, cells, a simulated run, or label masks for shapes alone.
 
+    Only the columns that the wanted observables read are loaded or measured.
+
     Parameters
     ----------
     source
         A folder with ``tracks.parquet``, a parquet table, a ``RUN.zarr``, or label masks.
-    shapes_only
-        Nothing but shapes will be asked for, so that a table of cells or a single frame will do.
+    only
+        Names of the observables wanted, all when None. Where none needs trajectories a table of
+        cells or a single frame will do.
     calibration
         Keyword arguments of `cellquant.io.read_labels`, for label masks.
     step
@@ -177,23 +180,27 @@ def open_source(
     Raises
     ------
     InputError
-        If the path is missing or is none of these.
+        If the path is missing or is none of these, or a name is unknown.
     """
+    from cellquant.observables import columns_read, needs_tracks
     from cellquant.tables import read_cells, read_tracks
 
+    shapes_only = only is not None and not needs_tracks(only)
     source = Path(source)
     if not source.exists():
         raise InputError(f"{source} does not exist; give tracks, a run or label masks.")
     if source.is_dir() and (source / "zarr.json").is_file():
         from cellquant.sim import open_run
 
-        return open_run(source).to_tracks()
+        return open_run(source).to_tracks(columns=columns_read(only))
     if source.is_dir() and (source / "tracks.parquet").is_file():
         if shapes_only and (source / "cells.parquet").is_file():
-            return read_cells(source)
-        return read_tracks(source)
+            return read_cells(source, columns=columns_read(only, of_cells=True))
+        return read_tracks(source, columns=columns_read(only))
     if source.suffix == ".parquet":
-        return read_cells(source) if source.name.startswith("cells") else read_tracks(source)
+        if source.name.startswith("cells"):
+            return read_cells(source, columns=columns_read(only, of_cells=True))
+        return read_tracks(source, columns=columns_read(only))
     if not shapes_only:
         raise InputError(
             f"{source} holds neither tracks nor a simulated run; make tracks with "
@@ -230,14 +237,12 @@ def observe_source(
     options
         Keyword arguments of `cellquant.observables.observe`.
     """
-    from cellquant.observables import needs_tracks
-
     folder = check_output(out)
     record = RunRecord("observe", {"source": str(source), "only": only, **(options or {})})
     with record.stage("read"):
         data = open_source(
             source,
-            shapes_only=only is not None and not needs_tracks(only),
+            only=only,
             calibration=calibration,
             step=step,
         )

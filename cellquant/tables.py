@@ -5,7 +5,7 @@ name: they travel beside the table and, on disk, in the parquet schema metadata.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -148,13 +148,15 @@ class Tracks:
         write_table(self.table, path, units=self.units, metadata=metadata)
 
 
-def read_cells(path: str | Path) -> Cells:
+def read_cells(path: str | Path, *, columns: Sequence[str] | None = None) -> Cells:
     """Read cells written by `Cells.write`.
 
     Parameters
     ----------
     path
         A parquet file, or a folder that holds ``cells.parquet``.
+    columns
+        Names out of `CELL_COLUMNS`: only these are read; all of them when None.
 
     Raises
     ------
@@ -164,8 +166,7 @@ def read_cells(path: str | Path) -> Cells:
     path = Path(path)
     if path.is_dir():
         path = path / "cells.parquet"
-    table, units, metadata = read_table(path)
-    _require(table, CELL_COLUMNS, path, "cells")
+    table, units, metadata = read_table(path, kind="cells", columns=columns or list(CELL_COLUMNS))
     try:
         width, height = metadata["field_of_view"]
         return Cells(
@@ -185,22 +186,15 @@ def read_cells(path: str | Path) -> Cells:
         ) from error
 
 
-def _require(table: pd.DataFrame, columns: Mapping[str, str], path: Path, kind: str) -> None:
-    missing = [name for name in columns if name not in table.columns]
-    if missing:
-        raise InputError(
-            f"{path} is not a {kind} table: it lacks the columns {', '.join(missing)}; "
-            "make one with 'cellquant track MASKS -o DIR'."
-        )
-
-
-def read_tracks(path: str | Path) -> Tracks:
+def read_tracks(path: str | Path, *, columns: Sequence[str] | None = None) -> Tracks:
     """Read tracks written by `Tracks.write`.
 
     Parameters
     ----------
     path
         A parquet file, or a folder that holds ``tracks.parquet``.
+    columns
+        Names out of `TRACK_COLUMNS`: only these are read; all of them when None.
 
     Returns
     -------
@@ -214,8 +208,7 @@ def read_tracks(path: str | Path) -> Tracks:
     path = Path(path)
     if path.is_dir():
         path = path / "tracks.parquet"
-    table, units, metadata = read_table(path)
-    _require(table, TRACK_COLUMNS, path, "tracks")
+    table, units, metadata = read_table(path, kind="tracks", columns=columns or list(TRACK_COLUMNS))
     try:
         box = metadata["box"]
         return Tracks(
@@ -263,8 +256,19 @@ def write_table(
     pq.write_table(arrow.replace_schema_metadata(schema), path, compression="zstd")
 
 
-def read_table(path: str | Path) -> tuple[pd.DataFrame, Units, dict[str, Any]]:
+def read_table(
+    path: str | Path, *, kind: str = "", columns: Sequence[str] | None = None
+) -> tuple[pd.DataFrame, Units, dict[str, Any]]:
     """Read a table written by `write_table`.
+
+    Parameters
+    ----------
+    path
+        The file to read.
+    kind
+        What the table holds, for the message when a column is missing.
+    columns
+        The columns to read, all of which must be there; whatever there is when None.
 
     Returns
     -------
@@ -276,17 +280,25 @@ def read_table(path: str | Path) -> tuple[pd.DataFrame, Units, dict[str, Any]]:
     Raises
     ------
     InputError
-        If the file is missing, is not parquet, or carries no units.
+        If the file is missing, is not parquet, lacks a column, or carries no units.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} does not exist; give the path of a parquet table.")
     try:
-        arrow = pq.read_table(path)
-        raw = arrow.schema.metadata or {}
+        schema = pq.read_schema(path)
+        raw = schema.metadata or {}
         units = Units(raw[b"length_unit"].decode(), raw[b"time_unit"].decode())
         metadata = json.loads(raw[b"cellquant"])
-        table = arrow.to_pandas()
+        missing = [name for name in columns or () if name not in schema.names]
+        if missing:
+            raise InputError(
+                f"{path} is not a {kind} table: it lacks the columns {', '.join(missing)}; "
+                "make one with 'cellquant track MASKS -o DIR'."
+            )
+        arrow = pq.read_table(path, columns=None if columns is None else list(columns))
+        # Each column is freed as soon as it is converted, or the table would be held twice.
+        table = arrow.to_pandas(split_blocks=True, self_destruct=True)
     except KeyError as error:
         raise InputError(
             f"{path} carries no {error} in its schema metadata, so its numbers have no unit; "

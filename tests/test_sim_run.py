@@ -7,13 +7,15 @@ import sys
 import time
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from cellquant.errors import InputError
+from cellquant.observables import observe
 from cellquant.sim import Scene, SimulationFailure, open_run, simulate
 from cellquant.sim import run as run_module
 from cellquant.sim.noise import BrownianTree
-from cellquant.tables import REDUCED
+from cellquant.tables import REDUCED, TRACK_COLUMNS
 
 SMALL = Scene(n_cells=9, phi=0.9)
 
@@ -160,6 +162,26 @@ def test_tracks_carry_the_true_contours():
     assert first[["x", "y"]].to_numpy() == pytest.approx(run.position[:, 4])
     assert first["time"].to_numpy() == pytest.approx(run.time)
     assert 3 < table["n_neighbours"].mean() <= 6
+    assert list(table.columns) == list(TRACK_COLUMNS)
+    for columns in (["frame", "area", "track_id"], ["y", "aspect_ratio"], ["n_neighbours"]):
+        part = run.to_tracks(columns=columns).table
+        assert set(part.columns) == set(columns)
+        pd.testing.assert_frame_equal(part, table[part.columns])
+
+
+@pytest.mark.parametrize("only", [["msd"], ["density", "structure_factor"]])
+def test_motion_of_a_run_measures_no_contour(only, monkeypatch):
+    run = simulate(Scene(n_cells=16), duration=2, dt=0.02)
+    expected = observe(run.to_tracks(), only=only)
+
+    def refuse(*args):
+        raise AssertionError("a contour was measured that no output shows")
+
+    monkeypatch.setattr("cellquant.sim.archive.measure_shapes", refuse)
+    monkeypatch.setattr("cellquant.sim.archive.Run._count_neighbours", refuse)
+    assert observe(run, only=only).summary == expected.summary
+    with pytest.raises(AssertionError, match="no output shows"):
+        observe(run, only=["shape_index"])
 
 
 def test_brownian_tree_is_one_path_at_every_depth():

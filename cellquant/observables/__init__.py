@@ -3,6 +3,7 @@
 from cellquant.observables.observe import (
     Observables,
     available_observables,
+    columns_read,
     needs_tracks,
     observe,
 )
@@ -11,6 +12,7 @@ from cellquant.observables.smoothing import remove_drift, retain, smooth_tracks
 __all__ = [
     "Observables",
     "available_observables",
+    "columns_read",
     "needs_tracks",
     "observe",
     "remove_drift",

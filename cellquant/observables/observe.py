@@ -13,19 +13,27 @@ from cellquant.observables import fields, measures, relaxations
 from cellquant.observables.context import Context, Settings
 from cellquant.observables.measures import Measure, Results
 from cellquant.storage import atomic_path, write_json
-from cellquant.tables import Cells, Tracks, Units, write_table
+from cellquant.tables import CELL_COLUMNS, TRACK_COLUMNS, Cells, Tracks, Units, write_table
 
 
 class _Entry(NamedTuple):
     meaning: str
     needs_tracks: bool
     measure: Measure
+    columns: tuple[str, ...] = ()  # beyond those that every observable reads
 
 
 _CATALOGUE: dict[str, _Entry] = {
     "density": _Entry("number density", False, measures.density),
-    "shape_index": _Entry("distribution of P/sqrt(A)", False, measures.shape_index),
-    "aspect_ratio": _Entry("distribution of the aspect ratio", False, measures.aspect_ratio),
+    "shape_index": _Entry(
+        "distribution of P/sqrt(A)", False, measures.shape_index, ("shape_index",)
+    ),
+    "aspect_ratio": _Entry(
+        "distribution of the aspect ratio",
+        False,
+        measures.aspect_ratio,
+        ("shape_index", "aspect_ratio"),
+    ),
     "wave_number": _Entry("q = 2 pi/d, and d", False, measures.wave_number),
     "speed": _Entry("distribution of |v| over one frame interval", True, measures.speed),
     "msd": _Entry("mean-square displacement", True, measures.msd),
@@ -108,6 +116,27 @@ def needs_tracks(names: Sequence[str]) -> bool:
     return any(_CATALOGUE[name].needs_tracks for name in _checked(names))
 
 
+def columns_read(names: Sequence[str] | None, *, of_cells: bool = False) -> list[str]:
+    """Columns of the table that the named observables read, in the order of the table.
+
+    Parameters
+    ----------
+    names
+        Names out of `available_observables`; all when None.
+    of_cells
+        Whether the table is one of cells, which has no track_id.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown.
+    """
+    entries = [_CATALOGUE[name] for name in _checked(names if names is not None else [*_CATALOGUE])]
+    read = {"frame", "x", "y", "area", "touches_border", "track_id"}
+    read = read.union(*(entry.columns for entry in entries))
+    return [name for name in (CELL_COLUMNS if of_cells else TRACK_COLUMNS) if name in read]
+
+
 def _checked(names: Sequence[str]) -> list[str]:
     unknown = [name for name in names if name not in _CATALOGUE]
     if unknown:
@@ -127,8 +156,8 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
     Parameters
     ----------
     source
-        `Tracks`; anything with a ``to_tracks()`` method, such as a run; or `Cells`, from which
-        only what needs no trajectories is measured.
+        `Tracks`; anything with a ``to_tracks(columns=...)`` method, such as a run; or `Cells`,
+        from which only what needs no trajectories is measured.
     only
         Names out of `available_observables`; all that the source allows when None.
     smoothing
@@ -168,13 +197,15 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
         If a name is unknown, a name needs trajectories that the source lacks, an option has no
         such value, or a track has two positions in one frame.
     """
+    if isinstance(only, str):
+        raise InputError(f"only must be a list of names, got {only!r}; write only=[{only!r}].")
     if not isinstance(source, (Tracks, Cells)):
         if not hasattr(source, "to_tracks"):
             raise InputError(
                 f"observables are measured from tracks, cells or a run, got "
                 f"{type(source).__name__}; open the source first."
             )
-        source = source.to_tracks()
+        source = source.to_tracks(columns=columns_read(only))
     wanted = _wanted(source, only)
     settings = _settings(options)
     context = Context(source, settings, wanted)
@@ -196,8 +227,6 @@ def _wanted(source: Tracks | Cells, only: Sequence[str] | None) -> list[str]:
     if only is None:
         has_tracks = isinstance(source, Tracks)
         return [name for name, entry in _CATALOGUE.items() if has_tracks or not entry.needs_tracks]
-    if isinstance(only, str):
-        raise InputError(f"only must be a list of names, got {only!r}; write only=[{only!r}].")
     wanted = _checked(only)
     if isinstance(source, Cells):
         moving = [name for name in wanted if _CATALOGUE[name].needs_tracks]

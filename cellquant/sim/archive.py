@@ -1,7 +1,9 @@
 """A run on disk: a zarr group that grows frame by frame and can be read meanwhile."""
 
 import json
+import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +22,7 @@ from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
 
 Floats = NDArray[np.float64]
 CHECKPOINT = "checkpoint.npz"
+_SHAPE_COLUMNS = ("perimeter", "shape_index", "aspect_ratio", "orientation")
 CHUNK = 262_144  # numbers of a chunk: what one write of a growing run touches
 
 
@@ -254,34 +257,54 @@ class Run:
         error = float(np.sqrt(np.sum(blocks.var(axis=1, ddof=1)) / n_blocks))
         return Stationarity(abs(drift) <= 2.0 * error, drift, error, n_blocks)
 
-    def to_tracks(self) -> Tracks:
+    def to_tracks(self, *, columns: Sequence[str] | None = None) -> Tracks:
         """The run as tracks, measured on the true contours, in reduced units.
 
         Label and track_id are the index of the cell plus one; x, y the unwrapped centres;
         n_neighbours counts the cells whose contours overlap; no cell touches a border.
+
+        Parameters
+        ----------
+        columns
+            Names out of `cellquant.tables.TRACK_COLUMNS`; contours are measured and neighbours
+            are counted only for a column that needs it. All columns when None.
+
+        Raises
+        ------
+        InputError
+            If the run holds no frame.
         """
+        wanted = [name for name in TRACK_COLUMNS if columns is None or name in columns]
         n_cells, n_frames = len(self.radius), self.n_frames
         if n_frames == 0:
             raise InputError(f"{self.path or 'the run'} holds no frame yet; simulate for longer.")
-        times, position = self.time, self.position
-        modes, polarity = self.modes, self.polarity
-        neighbours = self._count_neighbours()
-        frames = []
-        for t in range(n_frames):
-            table = measure_shapes(modes[t], polarity[t], self.radius)
-            table = table.drop(columns=["offset_x", "offset_y"])
-            table["x"], table["y"] = position[t, :, 0], position[t, :, 1]
-            table["frame"] = t
-            table["label"] = np.arange(1, n_cells + 1)
-            table["n_neighbours"] = neighbours[t]
-            frames.append(table)
-        table = pd.concat(frames, ignore_index=True)
-        table["touches_border"] = False
-        table["track_id"] = table["label"]
-        table["parent_track_id"] = 0
-        table["time"] = times[table["frame"].to_numpy()]
-        table = table.sort_values(["track_id", "frame"], ignore_index=True)
-        table = table[list(TRACK_COLUMNS)].astype(dict(TRACK_COLUMNS))
+        # One row per cell and frame, all frames of the first cell first.
+        label = np.repeat(np.arange(1, n_cells + 1), n_frames)
+        series: dict[str, Any] = {
+            "frame": np.tile(np.arange(n_frames), n_cells),
+            "label": label,
+            "area": np.repeat(math.pi * self.radius**2, n_frames),
+            "touches_border": np.zeros(len(label), bool),
+            "track_id": label,
+            "parent_track_id": np.zeros(len(label), np.int64),
+            "time": np.tile(self.time, n_cells),
+        }
+        if {"x", "y"} & set(wanted):
+            position = self.position
+            series["x"], series["y"] = position[:, :, 0].T.ravel(), position[:, :, 1].T.ravel()
+        if "n_neighbours" in wanted:
+            series["n_neighbours"] = self._count_neighbours().T.ravel()
+        shapes = [name for name in _SHAPE_COLUMNS if name in wanted]
+        if shapes:
+            modes, polarity = self.modes, self.polarity
+            measured = np.empty((len(shapes), n_cells, n_frames))
+            for t in range(n_frames):
+                table = measure_shapes(modes[t], polarity[t], self.radius)
+                measured[:, :, t] = table[shapes].to_numpy().T
+            series.update(zip(shapes, measured.reshape(len(shapes), -1), strict=True))
+        table = pd.DataFrame({name: series[name] for name in wanted}).astype(
+            {name: TRACK_COLUMNS[name] for name in wanted}
+        )
         return Tracks(
             table=table,
             units=REDUCED,
