@@ -46,12 +46,14 @@ def test_histogram_and_kernel_density_integrate_to_one() -> None:
 
 def test_mode_of_a_skewed_law_within_its_error() -> None:
     rng = np.random.default_rng(3)
-    found = [describe(rng.gamma(9, 0.05, 4000), blocks_of(4000)).summary for _ in range(60)]
+    found = [describe(rng.gamma(9, 0.05, 4000), blocks_of(4000)).summary for _ in range(200)]
     modes = np.array([f["mode"] for f in found])
     errors = np.array([f["mode_std_error"] for f in found])
     # The kernel shifts the mode of a skewed law by a part of its error.
     assert abs(modes.mean() - 0.4) < 0.5 * errors.mean()
-    assert errors.mean() == pytest.approx(modes.std(), rel=0.35)
+    assert errors.mean() == pytest.approx(modes.std(), rel=0.15)
+    # Student's quantile of 95 % with 15 degrees of freedom; the jackknife holds 0.85 of them.
+    assert np.mean(abs(modes - modes.mean()) < 2.13 * errors) >= 0.9
 
 
 def test_constant_values_and_no_values() -> None:
