@@ -1,7 +1,7 @@
 """What several observables share, each made once and only when an observable asks for it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,6 +16,7 @@ from cellquant.observables.windows import (
     BIN_CENTRES,
     BIN_WIDTH,
     WINDOW_POINTS,
+    RowsByFrame,
     Window,
     mean_diameter,
     split_frames,
@@ -127,6 +128,16 @@ class Context:
         return smooth(self.unsmoothed, self.smoothing)
 
     @cached_property
+    def smoothed_rows(self) -> RowsByFrame:
+        """Rows of the smoothed tracks by frame."""
+        return RowsByFrame(self.smoothed.table)
+
+    @cached_property
+    def source_rows(self) -> RowsByFrame:
+        """Rows of the source by frame."""
+        return RowsByFrame(self.source.table)
+
+    @cached_property
     def paths(self) -> "Trajectories":
         """The smoothed tracks as arrays."""
         from cellquant.observables.trajectories import from_tracks
@@ -236,7 +247,8 @@ class Context:
             if q == self.wave_number["q"]:
                 return self.whole_scattering
         elif window is not None:
-            paths = from_tracks(self.smoothed, frames=(window.start, window.stop))
+            rows = self.smoothed_rows.inside(window)
+            paths = from_tracks(replace(self.smoothed, table=rows))
             lags = log_lags(paths.max_lag)
         return scattering_average(
             paths, q, lags=lags, method=self.settings.scattering, stride=self.settings.stride

@@ -160,8 +160,7 @@ def _window_entry(
 ) -> dict[str, Any]:
     inside = per_frame["frame"].between(window.start, window.stop - 1)
     dt = context.tracks.frame_interval
-    table = context.source.table
-    d, _ = mean_diameter(table[table["frame"].between(window.start, window.stop - 1)])
+    d, _ = mean_diameter(context.source_rows.inside(window))
     entry: dict[str, Any] = {
         "start": window.start * dt,
         "stop": window.stop * dt,

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from cellquant.observables.smoothing import FloatArray, IntArray, ordered_rows
 from cellquant.tables import Tracks
@@ -68,15 +67,13 @@ class Trajectories:
         return int(np.max(np.diff(self.offsets), initial=1)) - 1
 
 
-def from_tracks(tracks: Tracks, *, frames: tuple[int, int] | None = None) -> Trajectories:
+def from_tracks(tracks: Tracks) -> Trajectories:
     """Lay a table of tracks out as arrays.
 
     Parameters
     ----------
     tracks
         Trajectories; rows without a finite position count as missing frames.
-    frames
-        Half-open range of frame numbers to keep; all when None.
 
     Returns
     -------
@@ -88,13 +85,6 @@ def from_tracks(tracks: Tracks, *, frames: tuple[int, int] | None = None) -> Tra
         If a track has two rows in one frame.
     """
     table = ordered_rows(tracks.table)
-    if frames is not None:
-        inside = (table["frame"] >= frames[0]) & (table["frame"] < frames[1])
-        table = table[inside]
-    return _from_rows(table, tracks)
-
-
-def _from_rows(table: pd.DataFrame, tracks: Tracks) -> Trajectories:
     x, y = table["x"].to_numpy(dtype=np.float64), table["y"].to_numpy(dtype=np.float64)
     track = table["track_id"].to_numpy(dtype=np.int64)
     frame = table["frame"].to_numpy(dtype=np.int64)

@@ -60,6 +60,28 @@ def split_frames(first: int, n_frames: int, points: int) -> list[Window]:
     return [Window(first + k * points, first + (k + 1) * points) for k in range(n_frames // points)]
 
 
+class RowsByFrame:
+    """The rows of a table found by frame, at the cost of the rows that are found.
+
+    Parameters
+    ----------
+    table
+        Any table with a column frame.
+    """
+
+    def __init__(self, table: pd.DataFrame) -> None:
+        frame = table["frame"].to_numpy()
+        self._table = table
+        self._order = np.argsort(frame, kind="stable")
+        self._frame = frame[self._order]
+
+    def inside(self, window: Window) -> pd.DataFrame:
+        """Rows of the frames of a window, in the order of the table."""
+        first, last = np.searchsorted(self._frame, (window.start, window.stop))
+        rows: pd.DataFrame = self._table.iloc[np.sort(self._order[first:last])]
+        return rows
+
+
 def density_per_frame(source: Tracks | Cells) -> pd.DataFrame:
     """Number density of every frame.
 
