@@ -46,6 +46,16 @@ class ObservablesConfig(_Strict):
     window: Annotated[int, Field(ge=2)] = 24
     bin_width: Positive = 250.0
     bin_centres: list[Positive] = [1100.0, 1350.0, 1600.0, 1850.0, 2100.0, 2350.0, 2600.0]
+    drift: bool = True
+    wave_number: Positive | Literal["2pi/d", "structure_factor_peak"] = "2pi/d"
+    scattering: Literal["bessel", "vectors"] = "bessel"
+    lags: list[Annotated[int, Field(ge=1)]] | None = None
+    stride: Annotated[int, Field(ge=1)] = 1
+    overlap_cutoff: Positive | None = None
+    van_hove_lag: Positive | None = None
+    core_range: tuple[NotNegative, Positive] | None = None
+    tail_range: tuple[NotNegative, Positive] | None = None
+    max_frames: Annotated[int, Field(ge=1)] = 32
 
 
 class TrialConfig(_Strict):
@@ -221,6 +231,16 @@ min_points = 24           # consecutive points that a trajectory must have
 window = 24               # points of an analysis window
 bin_width = 250           # cells/mm^2
 bin_centres = [1100, 1350, 1600, 1850, 2100, 2350, 2600]
+drift = true              # remove the motion of the centre of mass
+wave_number = "2pi/d"     # or "structure_factor_peak", or a number in 1/um
+scattering = "bessel"     # exact isotropic average; "vectors" for eight directions of q
+# stride = 1              # frames between time origins
+# lags = [1, 2, 5, 10]    # frames; about 35 spaced in the logarithm by default
+# overlap_cutoff = 6      # um; 0.3 mean diameters by default
+# van_hove_lag = 40       # min; tau_alpha by default
+# core_range = [0, 0.4]   # mean diameters, of the Gaussian fit; chosen from the data by default
+# tail_range = [0.8, 2]   # mean diameters, of the exponential fit
+# max_frames = 32         # frames on which structure is measured
 
 [[condition]]
 name = "untreated"

@@ -1,10 +1,12 @@
 """The program as users run it: exit codes, one-sentence errors, nothing half-written."""
 
+import inspect
 import json
 import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,9 @@ import pandas as pd
 import pytest
 import tifffile
 
+from cellquant.cli.movies import observe
+from cellquant.config import ObservablesConfig
+from cellquant.observables.settings import Settings
 from examples import drifting_discs, shuffled
 
 CALIBRATED = ("--pixel-size", "0.65", "--frame-interval", "10")
@@ -307,6 +312,27 @@ def test_equal_input_gives_byte_equal_tables(movie: Path, tmp_path: Path) -> Non
         assert cellquant("track", movie, "-o", tmp_path / name, *CALIBRATED).returncode == 0
     for table in ("tracks.parquet", "cells.parquet"):
         assert (tmp_path / "a" / table).read_bytes() == (tmp_path / "b" / table).read_bytes()
+
+
+def test_shell_and_file_offer_every_option_of_the_observables() -> None:
+    options = {field.name for field in fields(Settings)}
+    assert set(ObservablesConfig.model_fields) == options - {"condition", "trial"} | {"only"}
+    assert options - {"condition", "trial"} <= set(inspect.signature(observe).parameters)
+
+
+def test_options_of_observe_reach_the_result(movie: Path, tmp_path: Path) -> None:
+    tracks, out = tmp_path / "tracks", tmp_path / "out"
+    assert cellquant("track", movie, "-o", tracks, *CALIBRATED).returncode == 0
+    options = ("--only", "msd", "--no-drift", "--stride", "2", "--lags", "1,3")
+    done = cellquant("observe", tracks, "-o", out, *options)
+    assert done.returncode == 0, done.stderr
+    assert pd.read_parquet(out / "msd.parquet")["lag_time"].tolist() == [10, 30]
+    processing = json.loads((out / "summary.json").read_text())["processing"]
+    assert processing["drift_removed"] is False
+    assert processing["time_origin_stride"] == 2
+    wrong = cellquant("observe", tracks, "-o", out, "--lags", "1;3")
+    assert wrong.returncode == 2
+    assert "--lags takes numbers separated by commas" in wrong.stderr
 
 
 def test_config_init_prints_templates() -> None:

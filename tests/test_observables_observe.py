@@ -187,11 +187,24 @@ def test_shape_alone_loads_no_dynamics() -> None:
         ({"van_hove_lag": 0.0}, "van_hove_lag must be"),
         ({"lags": [0, 1]}, "lags must be"),
         ({"bin_width": 0.0}, "bin_width must be"),
+        ({"core_range": (0.4, 0.2)}, "core_range must be"),
+        ({"tail_range": (-1.0, 2.0)}, "tail_range must be"),
     ],
 )
 def test_impossible_options_are_refused(options: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         observe(movie(np.random.default_rng(5)), **options)
+
+
+def test_chosen_ranges_of_the_van_hove_fits_are_kept() -> None:
+    found = observe(
+        movie(np.random.default_rng(5)), only=["van_hove"], core_range=(0.0, 0.3),
+        tail_range=(0.3, 0.9), van_hove_lag=10.0,
+    ).summary["van_hove"]  # fmt: skip
+    assert found["core_range"] == [0.0, 0.3]
+    assert found["tail_range"][0] == 0.3
+    assert found["tail_range"][1] <= 0.9
+    assert found["tail_core_n"] == 0
 
 
 def test_what_is_not_a_source_is_refused() -> None:

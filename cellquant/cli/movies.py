@@ -204,9 +204,45 @@ def observe(
     min_points: Annotated[
         int | None, typer.Option(help="Consecutive points that a trajectory must have.")
     ] = None,
-    wave_number: Annotated[
-        float | None, typer.Option(help="q in 1/length unit; 2 pi/d by default.")
+    window: Annotated[
+        int | None,
+        typer.Option(help="Frames of an analysis window; 24 for movies, a whole run by default."),
     ] = None,
+    bin_width: Annotated[float | None, typer.Option(help="Density bins, cells/mm^2.")] = None,
+    bin_centres: Annotated[
+        str | None, typer.Option(help="Centres of the density bins, e.g. 1100,1350,1600.")
+    ] = None,
+    drift: Annotated[
+        bool, typer.Option(help="Remove the motion of the centre of mass of the population.")
+    ] = True,
+    wave_number: Annotated[
+        str, typer.Option(help="q: '2pi/d', 'structure_factor_peak' or a number in 1/length unit.")
+    ] = "2pi/d",
+    scattering: Annotated[
+        str, typer.Option(help="'bessel', the exact isotropic average, or 'vectors'.")
+    ] = "bessel",
+    lags: Annotated[
+        str | None, typer.Option(help="Lags in frames, e.g. 1,2,5,10; about 35 by default.")
+    ] = None,
+    stride: Annotated[int, typer.Option(help="Frames between time origins.")] = 1,
+    overlap_cutoff: Annotated[
+        float | None,
+        typer.Option(help="Distance of the overlap function; 0.3 mean diameters by default."),
+    ] = None,
+    van_hove_lag: Annotated[
+        float | None, typer.Option(help="Lag of the van Hove function; tau_alpha by default.")
+    ] = None,
+    core_range: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Range of the Gaussian fit, in mean diameters.", metavar="FROM TO"),
+    ] = None,
+    tail_range: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Range of the exponential fit, in mean diameters.", metavar="FROM TO"),
+    ] = None,
+    max_frames: Annotated[
+        int, typer.Option(help="Frames, evenly spaced, on which structure is measured.")
+    ] = 32,
     pixel_size: PixelSize = None,
     frame_interval: FrameInterval = None,
     units: UnitsOption = UnitChoice.physical,
@@ -229,7 +265,23 @@ def observe(
             f"observe needs one SOURCE and -o DIR, got {len(paths)} sources "
             f"{paths or ''}; '--list' shows the names that may follow --only."
         )
-    given = {"smoothing": smoothing, "min_points": min_points, "wave_number": wave_number}
+    given = {
+        "smoothing": smoothing,
+        "min_points": min_points,
+        "window": window,
+        "bin_width": bin_width,
+        "bin_centres": _numbers("bin-centres", bin_centres, float),
+        "drift": drift,
+        "wave_number": _wave_number(wave_number),
+        "scattering": scattering,
+        "lags": _numbers("lags", lags, int),
+        "stride": stride,
+        "overlap_cutoff": overlap_cutoff,
+        "van_hove_lag": van_hove_lag,
+        "core_range": core_range,
+        "tail_range": tail_range,
+        "max_frames": max_frames,
+    }
     observables, _ = observe_source(
         paths[0],
         output,
@@ -241,6 +293,24 @@ def observe(
     for line in summary_lines(observables.summary):
         say(line)
     note(f"wrote {output / 'summary.json'}")
+
+
+def _numbers(option: str, text: str | None, kind: type[int] | type[float]) -> Any:
+    if text is None:
+        return None
+    try:
+        return [kind(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(
+            f"--{option} takes numbers separated by commas, got {text!r}; e.g. 1,2,5."
+        ) from None
+
+
+def _wave_number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def export(

@@ -1,20 +1,19 @@
 """What several observables share, each made once and only when an observable asks for it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from cellquant.observables.blocks import jackknife_error, leave_one_out, sum_by_block
+from cellquant.observables.settings import Settings
 from cellquant.observables.shape import cell_blocks
 from cellquant.observables.smoothing import longest_runs, ordered_rows, remove_drift, retain
 from cellquant.observables.smoothing import smooth_tracks as smooth
 from cellquant.observables.windows import (
-    BIN_CENTRES,
-    BIN_WIDTH,
     WINDOW_POINTS,
     RowsByFrame,
     Window,
@@ -24,33 +23,10 @@ from cellquant.observables.windows import (
 from cellquant.tables import Cells, Tracks
 
 if TYPE_CHECKING:
-    from cellquant.observables.dynamics import LagAverage, ScatteringMethod
+    from cellquant.observables.dynamics import LagAverage
     from cellquant.observables.fits import StretchedExponential
     from cellquant.observables.relaxation import RelaxationTime
     from cellquant.observables.trajectories import Trajectories
-
-WaveNumber = float | Literal["2pi/d", "structure_factor_peak"]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Options of `cellquant.observables.observe`, documented there."""
-
-    smoothing: int | None = None
-    drift: bool = True
-    min_points: int = WINDOW_POINTS
-    window: int | None = None
-    bin_width: float = BIN_WIDTH
-    bin_centres: Sequence[float] = BIN_CENTRES
-    wave_number: WaveNumber = "2pi/d"
-    scattering: "ScatteringMethod" = "bessel"
-    lags: Sequence[int] | None = None
-    stride: int = 1
-    overlap_cutoff: float | None = None
-    van_hove_lag: float | None = None
-    max_frames: int = 32
-    condition: str | None = None
-    trial: str | None = None
 
 
 class Context:

@@ -76,7 +76,13 @@ def van_hove(context: Context, out: Results) -> None:
         out.tables["van_hove_components"] = _blank("displacement", "value", "std_error", counts="n")
         return
     lag = round(lag_time / context.tracks.frame_interval)
-    found = self_van_hove(context.unsmoothed_paths, lag, unit=d or 1.0)
+    found = self_van_hove(
+        context.unsmoothed_paths,
+        lag,
+        unit=d or 1.0,
+        core_range=context.settings.core_range,
+        tail_range=context.settings.tail_range,
+    )
     reasons = [found.fits[k] for k in ("reason", "core_reason", "tail_reason") if k in found.fits]
     entry.update(found.fits, **({"reason": "; ".join(reasons)} if reasons else {}))
     out.summary["van_hove"] = entry

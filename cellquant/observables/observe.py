@@ -10,8 +10,9 @@ import pandas as pd
 
 from cellquant.errors import InputError
 from cellquant.observables import fields, measures, relaxations
-from cellquant.observables.context import Context, Settings
+from cellquant.observables.context import Context
 from cellquant.observables.measures import Measure, Results
+from cellquant.observables.settings import checked_settings
 from cellquant.storage import atomic_path, write_json
 from cellquant.tables import CELL_COLUMNS, TRACK_COLUMNS, Cells, Tracks, Units, write_table
 
@@ -182,6 +183,9 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
         Distance of the overlap function in length units; 0.3 mean diameters when None.
     van_hove_lag
         Lag of the van Hove function in time units; tau_alpha when None.
+    core_range, tail_range
+        Ranges in which the Gaussian core and the exponential tail of the van Hove function are
+        fitted, in mean diameters; chosen from the data when None.
     max_frames
         Frames, evenly spaced, on which structure is measured; 32 by default.
     condition, trial
@@ -207,7 +211,7 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
             )
         source = source.to_tracks(columns=columns_read(only))
     wanted = _wanted(source, only)
-    settings = _settings(options)
+    settings = checked_settings(options)
     context = Context(source, settings, wanted)
     out = Results(_head(context))
     for name in wanted:
@@ -236,45 +240,6 @@ def _wanted(source: Tracks | Cells, only: Sequence[str] | None) -> list[str]:
                 "track it first."
             )
     return wanted
-
-
-def _settings(options: Mapping[str, Any]) -> Settings:
-    unknown = sorted(set(options) - set(Settings.__dataclass_fields__))
-    if unknown:
-        raise TypeError(f"observe() has no option {unknown[0]!r}")
-    settings = Settings(**options)
-    rules = (
-        ("smoothing", settings.smoothing is None or _odd(settings.smoothing), "odd and >= 1"),
-        ("min_points", settings.min_points >= 2, ">= 2"),
-        ("window", settings.window is None or settings.window >= 2, ">= 2 frames"),
-        ("stride", settings.stride >= 1, ">= 1 frame"),
-        ("bin_width", settings.bin_width > 0, "> 0"),
-        ("max_frames", settings.max_frames >= 1, ">= 1"),
-        ("scattering", settings.scattering in ("bessel", "vectors"), "'bessel' or 'vectors'"),
-        ("wave_number", _is_wave_number(settings.wave_number), "> 0, '2pi/d' or "
-         "'structure_factor_peak'"),
-        ("overlap_cutoff", _positive(settings.overlap_cutoff), "> 0"),
-        ("van_hove_lag", _positive(settings.van_hove_lag), "> 0"),
-        ("lags", settings.lags is None or min(settings.lags, default=0) >= 1, ">= 1 frame each"),
-    )  # fmt: skip
-    for name, good, rule in rules:
-        if not good:
-            raise InputError(f"{name} must be {rule}, got {getattr(settings, name)!r}.")
-    return settings
-
-
-def _odd(points: int) -> bool:
-    return points >= 1 and points % 2 == 1
-
-
-def _positive(value: float | None) -> bool:
-    return value is None or (value > 0 and bool(np.isfinite(value)))
-
-
-def _is_wave_number(value: Any) -> bool:
-    if isinstance(value, str):
-        return value in ("2pi/d", "structure_factor_peak")
-    return isinstance(value, (int, float)) and _positive(float(value))
 
 
 def _head(context: Context) -> dict[str, Any]:
