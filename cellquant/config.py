@@ -47,6 +47,7 @@ class ObservablesConfig(_Strict):
     bin_width: Positive = 250.0
     bin_centres: list[Positive] = [1100.0, 1350.0, 1600.0, 1850.0, 2100.0, 2350.0, 2600.0]
     drift: bool = True
+    keep_cut_cells: bool = False
     wave_number: Positive | Literal["2pi/d", "structure_factor_peak"] = "2pi/d"
     scattering: Literal["bessel", "vectors"] = "bessel"
     lags: list[Annotated[int, Field(ge=1)]] | None = None
@@ -232,6 +233,7 @@ window = 24               # points of an analysis window
 bin_width = 250           # cells/mm^2
 bin_centres = [1100, 1350, 1600, 1850, 2100, 2350, 2600]
 drift = true              # remove the motion of the centre of mass
+keep_cut_cells = false    # the border of the image cuts cells: leave their positions out
 wave_number = "2pi/d"     # or "structure_factor_peak", or a number in 1/um
 scattering = "bessel"     # exact isotropic average; "vectors" for eight directions of q
 # stride = 1              # frames between time origins

@@ -1,5 +1,7 @@
 """Displacement averages against naive loops, other programs and closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,6 +20,7 @@ from cellquant.observables.dynamics import (
     self_intermediate_scattering,
 )
 from cellquant.observables.trajectories import from_tracks, log_lags
+from cellquant.observables.windows import RowsByFrame, Window
 from cellquant.tables import Tracks
 from observables_examples import brownian, tracks_of, with_gaps
 
@@ -236,9 +239,11 @@ def test_lags_are_distinct_and_reach_both_ends(max_lag: int, n: int) -> None:
 
 
 def test_pooling_windows_adds_their_pairs(gappy: Tracks) -> None:
-    parts = [
-        scattering_average(from_tracks(gappy, frames=span), 5.0) for span in ((0, 15), (15, 30))
-    ]
+    rows = RowsByFrame(gappy.table)
+    halves = [rows.inside(Window(0, 15)), rows.inside(Window(15, 30))]
+    assert halves[1]["frame"].between(15, 29).all()
+    assert sum(map(len, halves)) == gappy.table["frame"].lt(30).sum()
+    parts = [scattering_average(from_tracks(replace(gappy, table=h)), 5.0) for h in halves]
     whole = pool(parts).table()
     assert whole["n_pairs"].sum() == sum(p.counts.sum() for p in parts)
     by_lag = whole.set_index("lag_time")["value"]

@@ -1,5 +1,7 @@
 """Smoothing, drift and retention against loops written from their definitions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cellquant.errors import InputError
-from cellquant.observables import remove_drift, retain, smooth_tracks
+from cellquant.observables import observe, remove_drift, retain, smooth_tracks
 from cellquant.tables import Tracks
 from observables_examples import brownian, tracks_of, with_gaps
 
@@ -135,3 +137,22 @@ def test_two_positions_in_one_frame_are_refused() -> None:
     for step in (smooth_tracks, remove_drift, retain):
         with pytest.raises(InputError, match="track 2 has 2 rows in frame 2"):
             step(twice)
+
+
+def test_cut_cells_give_no_motion() -> None:
+    rng = np.random.default_rng(8)
+    step = rng.normal(0, 0.1, (60, 40, 2))
+    step[:20] *= 0.5  # what is seen of the cells at the border moves less
+    border = np.repeat((np.arange(60) < 20)[:, None], 40, axis=1)
+    tracks = tracks_of(np.cumsum(step, axis=1), touches_border=border)
+    options = {"only": ["msd"], "drift": False, "smoothing": 1, "lags": [1]}
+    whole = observe(tracks, **options)
+    inner = observe(replace(tracks, table=tracks.table[~tracks.table["touches_border"]]), **options)
+    pd.testing.assert_frame_equal(whole.tables["msd"], inner.tables["msd"])
+    assert whole.summary["processing"]["cut_cells_left_out"] == 20 * 40
+    kept = observe(tracks, keep_cut_cells=True, **options)
+    expected = np.mean(np.diff(np.cumsum(step, axis=1), axis=1) ** 2) * 2
+    assert kept.tables["msd"]["value"][0] == pytest.approx(expected)
+    assert whole.tables["msd"]["value"][0] == pytest.approx(0.02, rel=0.1)
+    alone = observe(tracks_of(np.cumsum(step, axis=1), touches_border=True), **options)
+    assert "away from the border" in alone.summary["msd"]["reason"]

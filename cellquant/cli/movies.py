@@ -215,6 +215,12 @@ def observe(
     drift: Annotated[
         bool, typer.Option(help="Remove the motion of the centre of mass of the population.")
     ] = True,
+    keep_cut_cells: Annotated[
+        bool,
+        typer.Option(
+            "--keep-cut-cells", help="Let cells that the border of the image cuts into the motion."
+        ),
+    ] = False,
     wave_number: Annotated[
         str, typer.Option(help="q: '2pi/d', 'structure_factor_peak' or a number in 1/length unit.")
     ] = "2pi/d",
@@ -272,6 +278,7 @@ def observe(
         "bin_width": bin_width,
         "bin_centres": _numbers("bin-centres", bin_centres, float),
         "drift": drift,
+        "keep_cut_cells": keep_cut_cells,
         "wave_number": _wave_number(wave_number),
         "scattering": scattering,
         "lags": _numbers("lags", lags, int),

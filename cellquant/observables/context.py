@@ -11,7 +11,13 @@ import pandas as pd
 from cellquant.observables.blocks import jackknife_error, leave_one_out, sum_by_block
 from cellquant.observables.settings import Settings
 from cellquant.observables.shape import cell_blocks
-from cellquant.observables.smoothing import longest_runs, ordered_rows, remove_drift, retain
+from cellquant.observables.smoothing import (
+    leave_out_cut_cells,
+    longest_runs,
+    ordered_rows,
+    remove_drift,
+    retain,
+)
 from cellquant.observables.smoothing import smooth_tracks as smooth
 from cellquant.observables.windows import (
     WINDOW_POINTS,
@@ -90,8 +96,10 @@ class Context:
 
     @cached_property
     def unsmoothed(self) -> Tracks:
-        """Retained tracks, drift removed."""
+        """Retained tracks without cut cells, drift removed."""
         tracks = self.tracks
+        if not self.settings.keep_cut_cells:
+            tracks = leave_out_cut_cells(tracks)
         if self.settings.drift:
             tracks = remove_drift(tracks)
         return retain(tracks, self.settings.min_points)
@@ -135,10 +143,16 @@ class Context:
         if not len(self.tracks.table):
             return "there are no tracks"
         longest = int(longest_runs(ordered_rows(self.tracks.table)).max())
-        return (
+        reason = (
             f"no track has {self.settings.min_points} consecutive points (the longest has "
             f"{longest}); min_points sets how many are asked for"
         )
+        if longest >= self.settings.min_points:
+            reason = (
+                f"no track has {self.settings.min_points} consecutive points away from the border "
+                "of the image; keep_cut_cells takes the others in"
+            )
+        return reason
 
     @cached_property
     def lags(self) -> Any:

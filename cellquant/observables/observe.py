@@ -150,9 +150,10 @@ def _checked(names: Sequence[str]) -> list[str]:
 def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -> Observables:
     """Measure observables of tracks, of a simulated run, or of cells.
 
-    Trajectories are first expressed relative to the centre of mass of the population, then those
-    without enough consecutive points are dropped, then they are smoothed: with five points in an
-    open field of view, not at all in a periodic box. ``summary["processing"]`` says what was done.
+    Positions of cells that the border of the image cuts are left out; trajectories are expressed
+    relative to the centre of mass of the population; those without enough consecutive points are
+    dropped; then they are smoothed: with five points in an open field of view, not at all in a
+    periodic box. ``summary["processing"]`` says what was done.
 
     Parameters
     ----------
@@ -165,6 +166,9 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
         Points of the moving average, odd; 5 in an open field and 1 in a box when None.
     drift
         Whether the motion of the centre of mass is removed.
+    keep_cut_cells
+        Whether positions of cells that touch the border enter the motion; the centroid of the
+        part that is seen moves less than the cell.
     min_points
         Consecutive points a trajectory must have, 24 by default.
     window
@@ -265,6 +269,7 @@ def _processing(context: Context) -> dict[str, Any]:
         else "5 in an open field of view, 1 in a periodic box",
         "drift_removed": bool(drift and drift["removed"]),
         "drift": drift,
+        "cut_cells_left_out": context.unsmoothed.provenance.get("cut_cells_left_out", 0),
         "min_points": context.settings.min_points,
         "n_tracks_retained": context.unsmoothed.n_tracks,
         "window_points": context.window_points,

@@ -21,6 +21,7 @@ class Settings:
 
     smoothing: int | None = None
     drift: bool = True
+    keep_cut_cells: bool = False
     min_points: int = WINDOW_POINTS
     window: int | None = None
     bin_width: float = BIN_WIDTH

@@ -1,4 +1,4 @@
-"""What is done to trajectories before they are measured: smoothing, drift, retention."""
+"""What is done to trajectories before they are measured: cut cells, drift, retention, smoothing."""
 
 from dataclasses import replace
 from typing import Any
@@ -81,6 +81,32 @@ def _arrays(table: pd.DataFrame) -> tuple[IntArray, IntArray, FloatArray, FloatA
         x,
         y,
         finite,
+    )
+
+
+def leave_out_cut_cells(tracks: Tracks) -> Tracks:
+    """Leave out the positions of cells that the border of the image cuts.
+
+    The centroid of the visible part of a cut cell moves at about half the speed of the cell
+    across the border, so that such positions make motion look slower than it is. A track that
+    touches the border for a while has a gap there.
+
+    Parameters
+    ----------
+    tracks
+        Trajectories; not changed.
+
+    Returns
+    -------
+    Tracks
+        The rows that do not touch the border; ``provenance["cut_cells_left_out"]`` counts the
+        others.
+    """
+    whole = ~tracks.table["touches_border"].to_numpy(dtype=bool)
+    return replace(
+        tracks,
+        table=tracks.table[whole],
+        provenance={**tracks.provenance, "cut_cells_left_out": int(np.sum(~whole))},
     )
 
 
