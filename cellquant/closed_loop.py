@@ -1,13 +1,15 @@
 """The closed loop: simulate, render to masks, run the experiment pipeline, compare with the truth.
 
-Between the simulation and what the pipeline reports lie four steps, each of which may add an error;
-they are told apart by observing at every stage: the run itself (true contours, unwrapped paths in
-the periodic box), the true tracks in the field of view (borders, frame interval, pixels of the
-contours), and the tracks that were found in the masks (linking).
+Between the simulation and what the pipeline reports lie four steps, each of which may add an error.
+They are told apart by observing the same layer after each of them, so that most of the sampling
+noise is common to all: the run itself; the run at the frame interval of the camera; its true tracks
+in the field of view; the cells measured on the masks, with their true identities; and the tracks
+that were found.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,18 +22,83 @@ if TYPE_CHECKING:
     from cellquant.config import SceneConfig
     from cellquant.observables import Observables
     from cellquant.sim import Run
-    from cellquant.tables import Tracks
+    from cellquant.tables import Cells, Tracks
 
 LENGTH = 23.9  # um in one L0: a disc of 450 um^2
 TIME = 2.0  # min in one t0
 PIXEL = LENGTH / 30.0  # um: cells of 15 pixels radius
+FINER = 5  # frames of the run in one frame interval of the camera
 
-# Name in the table, place in the summary, exponents of length and time in its unit.
+STAGES = {
+    "truth": "the run itself",
+    "sampled": "the run at the frame interval of the camera",
+    "field": "its true tracks in the field of view",
+    "pixels": "cells measured on the masks, true identities",
+    "found": "tracks found",
+}
+# What the step from one stage to the next adds.
+STEPS = {
+    "sampled": "frame interval",
+    "field": "field of view",
+    "pixels": "pixels",
+    "found": "linking",
+}
+WANTED = (
+    "shape_index",
+    "wave_number",
+    "speed",
+    "msd",
+    "self_intermediate_scattering",
+    "tau_alpha",
+    "van_hove",
+)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number that every stage measures.
+
+    Attributes
+    ----------
+    label
+        Its name in the table.
+    unit
+        Its unit, in L0 and t0.
+    group, part, error
+        Its place in ``summary.json``, and that of its standard error.
+    length, time
+        Exponents of length and time in its unit.
+    sampled
+        Whether it is defined by the frame interval, so that its truth is that of the sampled run.
+    """
+
+    label: str
+    unit: str
+    group: str
+    part: str
+    error: str = "std_error"
+    length: int = 0
+    time: int = 0
+    sampled: bool = False
+
+
+MSD = Quantity("MSD at the relaxation time", "L0^2", "msd", "at_tau", "at_tau_std_error", length=2)
 QUANTITIES = (
-    ("mean shape index", "shape_index", "mean", (0, 0)),
-    ("mean diameter", "wave_number", "mean_diameter", (1, 0)),
-    ("relaxation time", "tau_alpha", "value", (0, 1)),
-    ("mean speed", "speed", "mean", (1, -1)),
+    Quantity("mean shape index", "1", "shape_index", "mean"),
+    Quantity(
+        "mean diameter", "L0", "wave_number", "mean_diameter", "mean_diameter_std_error", length=1
+    ),
+    Quantity("mean speed", "L0/t0", "speed", "mean", length=1, time=-1, sampled=True),
+    MSD,
+    Quantity("relaxation time", "t0", "tau_alpha", "value", time=1),
+    Quantity(
+        "van Hove core \N{GREEK SMALL LETTER SIGMA}²",
+        "d^2",
+        "van_hove",
+        "sigma2",
+        "sigma2_std_error",
+    ),
+    Quantity("van Hove tail \N{GREEK SMALL LETTER XI}", "d", "van_hove", "xi", "xi_std_error"),
 )
 
 
@@ -43,21 +110,18 @@ class Loop:
     ----------
     run
         The simulated run.
-    truth, field, found
-        Observables of the run, of the true tracks in the field of view, and of the tracks found
-        in the masks. All with the same smoothing and window.
+    observed
+        Observables of every stage, by its name in `STAGES`; all with the same options.
     tracks
         The tracks found.
     record
         How they were found.
     table
-        One row per quantity: truth, in_field, measured, their standard errors, and the errors.
+        One row per quantity, see `closed_loop_table`.
     """
 
     run: "Run"
-    truth: "Observables"
-    field: "Observables"
-    found: "Observables"
+    observed: "Mapping[str, Observables]"
     tracks: "Tracks"
     record: RunRecord
     table: "pd.DataFrame"
@@ -69,17 +133,21 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
     Parameters
     ----------
     scene
-        The scene and its run; frames are one every ``save_every``.
+        The scene and its run; the camera takes a frame every ``save_every``, and the run is saved
+        five times as often.
     folder
-        Output folder: ``run.zarr``, ``masks.tif`` with ``masks_truth``, the folders ``truth``,
-        ``field`` and ``found`` of observables, and ``closed_loop.json``.
+        Output folder: ``run.zarr``, ``masks.tif`` with ``masks_truth``, a folder of observables
+        for each of `STAGES`, and ``closed_loop.json``.
     step
         Gives a progress callback for each stage.
     """
     from cellquant.io import read_labels
+    from cellquant.observables import columns_read
     from cellquant.sim import render
 
-    run = simulate_scene(scene, folder / "run.zarr", step=step)
+    interval = scene.save_every or 1.0
+    finer = scene.model_copy(update={"save_every": interval / FINER})
+    run = simulate_scene(finer, folder / "run.zarr", step=step)
     with step("render") as progress:
         rendering = render(
             run,
@@ -87,71 +155,120 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
             pixel_size=PIXEL,
             length=LENGTH,
             time=TIME,
+            step=FINER,
             progress=progress,
         )
     masks = read_labels(folder / "masks.tif")
-    _, tracks, record = track_movie(masks, folder / "found", step=step)
+    cells, tracks, record = track_movie(masks, folder / "found", step=step)
+    truth = run.to_tracks(columns=columns_read(WANTED))
     observed = {}
-    for name, source in (
-        ("truth", run.to_tracks()),
-        ("field", rendering.tracks),
-        ("found", tracks),
+    for name, origin, source in (
+        ("truth", "../run.zarr", truth),
+        ("sampled", "../run.zarr", _every(truth, FINER)),
+        ("field", "../masks_truth", rendering.tracks),
+        ("pixels", "../found/cells.parquet", _with_identities(cells, rendering.tracks)),
+        ("found", "../masks.tif", tracks),
     ):
-        made = record if name == "found" else RunRecord("observe", {"source": name})
+        settings = {"source": origin, "stage": STAGES[name]}
+        made = record if name == "found" else RunRecord("observe", settings)
         # No smoothing: the simulation has no localisation noise, and the paths are compared.
-        observed[name] = observe_into(
-            source, folder / name, made, options={"smoothing": 1}, step=step
-        )
+        options = {"smoothing": 1, "only": list(WANTED)}
+        observed[name] = observe_into(source, folder / name, made, options=options, step=step)
         made.write(folder / name)
-    table = closed_loop_table({name: o.summary for name, o in observed.items()})
+    table = closed_loop_table({name: _values(o) for name, o in _with_msd(observed).items()})
     known = table.astype(object).where(table.notna(), None)
     write_json(folder / "closed_loop.json", known.to_dict("records"))
-    return Loop(run, observed["truth"], observed["field"], observed["found"], tracks, record, table)
+    return Loop(run, observed, tracks, record, table)
 
 
-def closed_loop_table(summaries: Mapping[str, Mapping[str, Any]]) -> "pd.DataFrame":
-    """Truth, measurement and error of every quantity, in reduced units.
+def _every(tracks: "Tracks", step: int) -> "Tracks":
+    """Every step-th frame of the tracks."""
+    kept = tracks.table[tracks.table["frame"] % step == 0]
+    table = kept.assign(frame=kept["frame"] // step).reset_index(drop=True)
+    return replace(tracks, table=table, frame_interval=tracks.frame_interval * step)
+
+
+def _with_identities(cells: "Cells", truth: "Tracks") -> "Tracks":
+    """The measured cells, linked as the truth says."""
+    known = truth.table[["frame", "label", "track_id", "parent_track_id", "time"]]
+    from cellquant.tables import TRACK_COLUMNS
+
+    table = known.merge(cells.table, on=["frame", "label"])
+    table = table.sort_values(["track_id", "frame"], ignore_index=True)
+    return replace(truth, table=table[list(TRACK_COLUMNS)])
+
+
+def _with_msd(observed: "Mapping[str, Observables]") -> "dict[str, Observables]":
+    """Add the MSD at the true relaxation time to the summaries, interpolated between lags."""
+    import numpy as np
+
+    tau = observed["truth"].summary["tau_alpha"]["value"]
+    extended = {}
+    for name, one in observed.items():
+        table = one.tables["msd"]
+        lag = table["lag_time"].to_numpy()
+        found: dict[str, float | None] = {"at_tau": None, "at_tau_std_error": None}
+        time = None if tau is None else tau * (1.0 if one.units.time == "t0" else TIME)
+        if time is not None and lag.size and lag[0] <= time <= lag[-1]:
+            value = np.exp(np.interp(np.log(time), np.log(lag), np.log(table["value"])))
+            error = np.interp(time, lag, table["std_error"])
+            found = {"at_tau": float(value), "at_tau_std_error": float(error)}
+        extended[name] = replace(one, summary={**one.summary, "msd": found})
+    return extended
+
+
+def _values(observed: "Observables") -> "dict[str, tuple[float, float]]":
+    """Value and standard error of every quantity in reduced units; NaN where not measured."""
+    reduced = observed.units.time == "t0"
+    values = {}
+    for quantity in QUANTITIES:
+        group = observed.summary.get(quantity.group) or {}
+        scale = 1.0 if reduced else LENGTH**quantity.length * TIME**quantity.time
+        value, error = (group.get(name) for name in (quantity.part, quantity.error))
+        values[quantity.label] = (
+            float("nan") if value is None else value / scale,
+            float("nan") if error is None else error / scale,
+        )
+    return values
+
+
+def closed_loop_table(stages: "Mapping[str, Mapping[str, tuple[float, float]]]") -> "pd.DataFrame":
+    """Truth, measurement and error of every quantity, and what each step adds to the error.
 
     Parameters
     ----------
-    summaries
-        Of the run (``truth``, in L0 and t0), the true tracks in the field (``field``) and the
-        tracks found (``found``), both in um and min.
+    stages
+        By the name of the stage (`STAGES`), for each quantity its value and standard error in
+        units of the model.
 
     Returns
     -------
     pandas.DataFrame
-        quantity, unit, truth, truth_std_error, in_field, measured, measured_std_error, error
-        (measured/truth - 1), from_field (in_field/truth - 1: borders, frame interval and finite
-        window) and from_masks (measured/in_field - 1: pixels and linking). NaN where a quantity
-        could not be measured.
+        quantity, unit, truth, truth_std_error, measured, measured_std_error, error
+        (measured/truth - 1), then for each step its share: this stage over the one before,
+        minus 1. The speed is defined by the frame interval: its truth is the sampled run's. NaN
+        where a quantity could not be measured.
     """
     import pandas as pd
 
+    names = list(STAGES)
     rows = []
-    for label, group, part, (length, time) in QUANTITIES:
-        scale = LENGTH**length * TIME**time
-        truth = _number(summaries["truth"], group, part)
-        inside = _number(summaries["field"], group, part) / scale
-        found = _number(summaries["found"], group, part) / scale
-        error = "mean_diameter_std_error" if part == "mean_diameter" else "std_error"
-        rows.append(
-            {
-                "quantity": label,
-                "unit": {(0, 0): "1", (1, 0): "L0", (0, 1): "t0", (1, -1): "L0/t0"}[length, time],
-                "truth": truth,
-                "truth_std_error": _number(summaries["truth"], group, error),
-                "in_field": inside,
-                "measured": found,
-                "measured_std_error": _number(summaries["found"], group, error) / scale,
-                "error": found / truth - 1.0,
-                "from_field": inside / truth - 1.0,
-                "from_masks": found / inside - 1.0,
-            }
-        )
+    for quantity in QUANTITIES:
+        label = quantity.label
+        values = {name: stages[name][label][0] for name in names}
+        origin = "sampled" if quantity.sampled else "truth"
+        values["truth"] = values[origin]
+        measured, measured_error = stages["found"][label]
+        row: dict[str, Any] = {
+            "quantity": label,
+            "unit": quantity.unit,
+            "truth": values["truth"],
+            "truth_std_error": stages[origin][label][1],
+            "measured": measured,
+            "measured_std_error": measured_error,
+            "error": measured / values["truth"] - 1.0,
+        }
+        for before, after in pairwise(names):
+            row[f"from_{STEPS[after].replace(' ', '_')}"] = values[after] / values[before] - 1.0
+        rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _number(summary: Mapping[str, Any], group: str, part: str) -> float:
-    value = (summary.get(group) or {}).get(part)
-    return float("nan") if value is None else float(value)

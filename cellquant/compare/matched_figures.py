@@ -139,11 +139,13 @@ def layer_figure(groups: Sequence[Group]) -> Figure | None:
         result = group.members[0]
         name = f"layer-{index + 1}"
         if result.stack is not None:
-            frame = len(result.stack) // 2
+            frame = len(result.stack) - 1
             calibration = result.stack.calibration
             svg = draw_masks(result.stack[frame], pixel_size=calibration.pixel_size,
                              units=calibration.units)  # fmt: skip
-            words = f"Segmented frame {frame} of {group.name}, cells in different colours."
+            words = (
+                f"Segmented frame {frame}, the last, of {group.name}, cells in different colours."
+            )
         elif result.run is not None:
             svg = draw_contours(*contours_of(result.run), units=result.units)
             words = f"Contours of all cells of {group.name} at the end of the run."
@@ -155,8 +157,8 @@ def layer_figure(groups: Sequence[Group]) -> Figure | None:
     return Figure(
         name="layer",
         title="One moment",
-        caption="Segmented frame of the movie; contours of all cells of the simulated layer, which "
-        "continues periodically at its edges.",
+        caption="Last segmented frame of the movie; contours of all cells at the end of the "
+        "simulation, whose layer continues periodically at its edges.",
         panels=tuple(panels),
         wide=True,
     )

@@ -211,7 +211,7 @@ def draw_paths(
             ]
             axes.add_collection(LineCollection(lines, colors=series_colour(series), linewidths=0.8))
             ends = [line[-1] for line in lines]
-            if ends and len(shown) < 3000:
+            if ends and shown["track_id"].nunique() < 400:
                 axes.plot(*np.transpose(ends), ".", color=series_colour(series), markersize=3)
         if frame is not None:
             a, b, c, d = frame
