@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 CORE := $(VENV)/.core
 FULL := $(VENV)/.full
 
-.PHONY: demo test test-slow bench lint clean
+.PHONY: demo study test test-slow bench lint clean
 
 $(CORE): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -18,6 +18,9 @@ $(FULL): $(CORE)
 
 demo: $(CORE)
 	$(BIN)/cellquant demo -o demo
+
+study: $(CORE)
+	$(BIN)/python examples/hela_study/study.py -o study
 
 test: $(FULL)
 	$(BIN)/ruff check .
@@ -36,4 +39,4 @@ lint: $(FULL)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) demo dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo study dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

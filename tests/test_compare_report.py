@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from cellquant.compare.figures import Curve, Scale, draw_curves
 from cellquant.compare.page import Page, Section, flatten, format_value, render_page, write_page
-from cellquant.compare.pictures import draw_contours, draw_masks, thin_paths
+from cellquant.compare.pictures import MaskFrame, draw_contours, draw_masks, thin_paths
 from cellquant.compare.report import command_lines, experiment_report
 from cellquant.compare.results import Result, read_result, read_scalars, unit_text
 from cellquant.compare.svg import THEME, compact_path
@@ -293,7 +293,7 @@ def test_mask_picture_has_one_tone_per_cell_and_a_true_scale_bar() -> None:
     labels = np.zeros((60, 100), np.int64)
     labels[10:30, 10:40] = 70000
     labels[35:55, 50:90] = 2
-    svg = draw_masks(labels, pixel_size=0.5, units=PHYSICAL)
+    svg = draw_masks([MaskFrame(labels)], pixel_size=0.5, units=PHYSICAL)
     picture = decode(svg)
     assert picture.shape == (60, 100, 4)
     assert (picture[labels == 0][:, 3] == 0).all()
@@ -307,7 +307,7 @@ def test_mask_picture_has_one_tone_per_cell_and_a_true_scale_bar() -> None:
 
 def test_large_masks_become_a_small_picture_with_the_same_scale() -> None:
     labels = np.kron(np.arange(1, 401).reshape(20, 20), np.ones((100, 100), np.int32))
-    svg = draw_masks(labels, pixel_size=1.0, units=PHYSICAL)
+    svg = draw_masks([MaskFrame(labels)], pixel_size=1.0, units=PHYSICAL)
     assert max(decode(svg).shape) <= 900
     assert 'viewBox="0 0 2000 ' in svg
 

@@ -233,6 +233,32 @@ def test_enlarging_works_with_mouse_and_keyboard(browser, path: Path) -> None:
         assert visit.messages == []
 
 
+def test_stepping_through_frames_by_keyboard(browser, pages: dict[str, Path]) -> None:
+    with Visit(browser, pages["report"]) as visit:
+        page = visit.page
+        figure = page.locator("#segmented-frame")
+        slider = figure.get_by_role("slider", name="Step through")
+        frames = figure.locator("svg .step")
+        assert frames.count() > 2
+        shown = figure.locator("svg .step:not([display])")
+        first = shown.get_attribute("data-title")
+        slider.focus()
+        page.keyboard.press("Home")
+        assert shown.count() == 1
+        assert shown.get_attribute("data-title") == frames.nth(0).get_attribute("data-title")
+        page.keyboard.press("End")
+        last = frames.nth(frames.count() - 1).get_attribute("data-title")
+        assert shown.get_attribute("data-title") == last != first
+        assert figure.locator("output").text_content() == last
+        assert slider.get_attribute("aria-valuetext") == last
+        # The enlarged copy steps by itself.
+        figure.get_by_role("button", name="Enlarge").click()
+        page.locator("dialog[open]").get_by_role("slider").press("Home")
+        assert page.locator("dialog[open] svg .step:not([display])").count() == 1
+        assert shown.get_attribute("data-title") == last
+        assert visit.messages == []
+
+
 @pytest.mark.parametrize("width", [320, 390, 768])
 def test_narrow_screens_do_not_scroll_sideways(browser, path: Path, width: int) -> None:
     with Visit(browser, path, viewport={"width": width, "height": 800}) as visit:

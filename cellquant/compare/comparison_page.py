@@ -49,8 +49,8 @@ MAX_TABLES = 6
 
 def build_comparison(comparison: Comparison) -> Page:
     """Put the page of a comparison together."""
-    groups = add_sources(comparison.groups)
     pairs = [(a, b, comparison.verdicts(a, b)) for a, b in comparison.pairs()]
+    groups = add_sources(_closest_first(comparison, pairs))
     sections = [
         _verdict_section(pairs),
         _figures("layers", "The layers", [layer_figure(groups), paths_figure(groups)], _LAYER),
@@ -81,7 +81,9 @@ def build_comparison(comparison: Comparison) -> Page:
 
 
 _LAYER = (
-    "What each side looks like. Colours tell neighbouring cells apart and mean nothing else.",
+    "What each side looks like. Colours tell neighbouring cells apart and mean nothing else. Where "
+    "there are many scenes, these and the figures below show those with which most numbers of the "
+    "experiments agree.",
 )
 _SHAPE = (
     "The shape index p = P/√A compares the outline of a cell with its area: 3.54 for a disc, "
@@ -127,6 +129,19 @@ def _count(number: int, noun: str) -> str:
 
 
 Pairs = Sequence[tuple[Group, Group, Sequence[Verdict]]]
+
+
+def _closest_first(comparison: Comparison, pairs: Pairs) -> list[Group]:
+    """The experiments, then the scenes, those first with which most numbers agree.
+
+    Figures show the first few of each side.
+    """
+    share = dict.fromkeys((group.name for group in comparison.groups), 0.0)
+    if comparison.experiments:
+        for _, second, verdicts in pairs:
+            share[second.name] += _share(verdicts)
+    models = sorted(comparison.simulations, key=lambda group: -share[group.name])
+    return [*comparison.experiments, *models]
 
 
 def _glance(comparison: Comparison, pairs: Pairs) -> tuple[Headline, ...]:

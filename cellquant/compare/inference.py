@@ -11,6 +11,8 @@ from cellquant.compare.ranking import REDUCED_UNITS, Units, common_features, fea
 from cellquant.errors import InputError
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+# Of errors inside one recording: 16 to 25 spatial blocks, the smaller number less one.
+BLOCK_FREEDOM = 15
 FACTORS = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0)
 
 
@@ -33,8 +35,8 @@ class Posterior:
     emulator
         What the likelihood was computed with.
     target
-        Features of the target, their own errors, the errors that they share, and whether they
-        come from a single recording.
+        Features of the target, their own errors, the errors that they share, whether they come
+        from a single recording, and the degrees of freedom of the errors.
     """
 
     names: tuple[str, ...]
@@ -43,7 +45,7 @@ class Posterior:
     features: tuple[str, ...]
     bounds: Mapping[str, tuple[float, float]]
     emulator: "Emulator"
-    target: tuple[FloatArray, FloatArray, FloatArray, bool]
+    target: tuple[FloatArray, FloatArray, FloatArray, bool, int]
 
     def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
         """Low end, median and high end of the central interval of one parameter."""
@@ -123,8 +125,11 @@ class Emulator:
         error: FloatArray,
         shared: FloatArray,
         single: bool,
+        freedom: int,
     ) -> FloatArray:
         """Logarithm of the probability of the observed features at each point.
+
+        A multivariate t law: the size of the errors is itself known from few replicates.
 
         Parameters
         ----------
@@ -136,6 +141,8 @@ class Emulator:
             (features, sources) errors that several features have in common.
         single
             The errors were estimated inside one recording.
+        freedom
+            Degrees of freedom of the errors.
         """
         mean, deviation = self.predict(points)
         spread = np.hypot(deviation, self.single_run_error(points, error) if single else error)
@@ -144,7 +151,8 @@ class Emulator:
         factor = np.linalg.cholesky(total)
         z = np.linalg.solve(factor, (value - mean)[..., None])[..., 0]
         volume = np.log(factor[:, diagonal, diagonal]).sum(axis=1)
-        out: FloatArray = -0.5 * (z**2).sum(axis=1) - volume
+        tail = np.log1p((z**2).sum(axis=1) / freedom)
+        out: FloatArray = -0.5 * (freedom + len(value)) * tail - volume
         return out
 
 
@@ -219,8 +227,9 @@ def fit_parameters(
     """Estimate phi, v0 and eta of a target, with credible regions, from a sweep.
 
     A Gaussian process per feature (anisotropic squared exponential plus a linear trend,
-    scikit-learn) is fitted to the scenes; the likelihood of the target's features is Gaussian
-    with the errors of target and emulator, correlated as the scenes scatter about the emulator.
+    scikit-learn) is fitted to the scenes; the likelihood of the target's features is a t law
+    with the errors of target and emulator, correlated as the scenes scatter about the emulator;
+    its degrees of freedom are those of the target's errors, trials or blocks less one.
     The error of a single run or recording says nothing of the scatter between runs, so it is
     widened by the factor by which the scenes scatter more than they say. The prior is flat over
     the range of the sweep: nothing is said beyond it.
@@ -265,12 +274,13 @@ def fit_parameters(
     value = np.array([ours[f].value for f in emulator.features])
     error = np.array([ours[f].own_error for f in emulator.features])
     single = target.n == 1
+    freedom = BLOCK_FREEDOM if single else target.n - 1
     shared = np.array([ours[f].unit_error for f in emulator.features])
     low, high = emulator.low, emulator.high
     start = low + qmc.Sobol(len(low), seed=seed).random(n_points) * (high - low)
     with threadpool_limits(1):  # the matrices are too small for more to pay
         samples, density = _sample(
-            lambda points: emulator.log_likelihood(points, value, error, shared, single),
+            lambda points: emulator.log_likelihood(points, value, error, shared, single, freedom),
             start,
             low,
             high,
@@ -284,7 +294,7 @@ def fit_parameters(
         emulator.features,
         bounds,
         emulator,
-        (value, error, shared, single),
+        (value, error, shared, single, freedom),
     )
 
 
@@ -423,7 +433,7 @@ def sensitivity(posterior: Posterior) -> dict[str, dict[str, float]]:
     """
     middle = np.array([posterior.interval(name)[1] for name in posterior.names])
     out: dict[str, dict[str, float]] = {feature: {} for feature in posterior.features}
-    _, error, shared, single = posterior.target
+    _, error, shared, single, _ = posterior.target
     if single:
         error = posterior.emulator.single_run_error(middle[None], error)[0]
     deviation = np.sqrt(error**2 + (shared**2).sum(axis=1))

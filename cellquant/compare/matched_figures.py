@@ -132,7 +132,7 @@ def hove_figure(groups: Sequence[Group]) -> Figure | None:
 
 def layer_figure(groups: Sequence[Group]) -> Figure | None:
     """Segmented frame of a movie beside a snapshot of the model."""
-    from cellquant.compare.pictures import contours_of, draw_contours, draw_masks
+    from cellquant.compare.pictures import MaskFrame, contours_of, draw_contours, draw_masks
 
     panels = []
     for index, group in enumerate(with_pictures(groups)):
@@ -141,8 +141,11 @@ def layer_figure(groups: Sequence[Group]) -> Figure | None:
         if result.stack is not None:
             frame = len(result.stack) - 1
             calibration = result.stack.calibration
-            svg = draw_masks(result.stack[frame], pixel_size=calibration.pixel_size,
-                             units=calibration.units)  # fmt: skip
+            svg = draw_masks(
+                [MaskFrame(result.stack[frame])],
+                pixel_size=calibration.pixel_size,
+                units=calibration.units,
+            )
             words = (
                 f"Segmented frame {frame}, the last, of {group.name}, cells in different colours."
             )
@@ -242,8 +245,9 @@ def _by_side(groups: Sequence[Group], measure: Measure) -> list[tuple[str, list[
         for series, group in members[:MAX_CURVES]:
             curves += measure(group, series)
         if curves:
-            more = len(members) - MAX_CURVES
-            sides.append((f"{title} (first {MAX_CURVES})" if more > 0 else title, curves))
+            if len(members) > MAX_CURVES:
+                title = f"{title} ({MAX_CURVES} of {len(members)})"
+            sides.append((title, curves))
     return sides
 
 

@@ -14,7 +14,7 @@ from cellquant.compare.figures import (
     draw_curves,
 )
 from cellquant.compare.page import Figure, Panel, format_value
-from cellquant.compare.pictures import draw_masks, draw_paths, thin_paths
+from cellquant.compare.pictures import MaskFrame, draw_masks, draw_paths, thin_paths
 from cellquant.compare.results import Result, curve_of, look_up, pretty_unit, scale_of, unit_text
 
 if TYPE_CHECKING:
@@ -23,32 +23,44 @@ if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
     from cellquant.tables import Cells, Tracks
 
+MAX_STEPS = 9  # frames to step through
+
 
 def masks_figure(
     stack: "LabelStack", tracks: "Tracks", *, raw: "ImageStack | None" = None
 ) -> Figure:
-    """The segmented middle frame with a scale bar; outlines on the recorded image when given."""
-    index = len(stack) // 2
-    number = stack.frame_numbers[index]
-    labels = stack[index]
-    here = tracks.table[tracks.table["frame"] == number]
-    identities = dict(zip(here["label"].tolist(), here["track_id"].tolist(), strict=True))
+    """The segmented middle frame with a scale bar, and others to step through.
+
+    Outlines on the recorded image when it is given.
+    """
+    middle = len(stack) // 2
+    indices = {middle, *np.linspace(0, len(stack) - 1, MAX_STEPS).round().astype(int).tolist()}
+    unit = tracks.units.time
+    frames = []
+    for index in sorted(indices):
+        number = stack.frame_numbers[index]
+        here = tracks.table[tracks.table["frame"] == number]
+        frames.append(
+            MaskFrame(
+                stack[index],
+                f"frame {number}" + _moment(number * tracks.frame_interval, unit),
+                None if raw is None else raw[index],
+                dict(zip(here["label"].tolist(), here["track_id"].tolist(), strict=True)),
+            )
+        )
+    shown = sorted(indices).index(middle)
     calibration = stack.calibration
     svg = draw_masks(
-        labels,
-        pixel_size=calibration.pixel_size,
-        units=calibration.units,
-        raw=None if raw is None else raw[index],
-        identities=identities,
+        frames, shown=shown, pixel_size=calibration.pixel_size, units=calibration.units
     )
-    count = int(np.unique(labels[labels > 0]).size)
-    time, unit = number * tracks.frame_interval, tracks.units.time
-    moment = "" if unit == "frame" else f" (t = {time:g} {pretty_unit(unit)})"
-    shown = "Outlines of the cells on the recorded image" if raw is not None else "Label masks"
+    number, count = stack.frame_numbers[middle], len(frames[shown].identities or {})
+    here = tracks.table[tracks.table["frame"] == number]
+    what = "Outlines of the cells on the recorded image" if raw is not None else "Label masks"
+    colours = "A cell keeps its colour from frame to frame."
     return Figure(
         name="segmented-frame",
         title="Segmented frame",
-        caption=f"{shown} of frame {number}{moment}, {count} cells.",
+        caption=f"{what} of {frames[shown].title}, {count} cells. {colours}",
         panels=(
             Panel(
                 "segmented-frame",
@@ -59,6 +71,10 @@ def masks_figure(
         ),
         data=here[["frame", "label", "track_id", "x", "y", "area", "shape_index"]],
     )
+
+
+def _moment(time: float, unit: str) -> str:
+    return "" if unit == "frame" else f" (t = {time:g} {pretty_unit(unit)})"
 
 
 def density_figure(tracks: "Tracks", cells: "Cells | None") -> Figure:

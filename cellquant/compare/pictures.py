@@ -2,7 +2,8 @@
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
 MAX_PIXELS = 900
+MAX_STEP_PIXELS = 450
 MAX_POINTS = 12_000
 # Twelve tones of like lightness, readable on light and on dark ground (RGB).
 _TONES = np.array(
@@ -40,54 +42,88 @@ _TONES = np.array(
 )  # fmt: skip
 
 
-def draw_masks(
-    labels: IntArray,
-    *,
-    pixel_size: float,
-    units: Units,
-    raw: np.ndarray[Any, Any] | None = None,
-    identities: Mapping[int, int] | None = None,
-) -> str:
-    """Draw one frame of label masks with a scale bar, as an ``<svg>`` element.
+@dataclass(frozen=True)
+class MaskFrame:
+    """One frame to draw.
 
-    Parameters
+    Attributes
     ----------
     labels
         (H, W) label masks, 0 for background.
-    pixel_size
-        Edge of a pixel, in ``units.length``.
-    units
-        Unit names, for the scale bar.
+    title
+        What is said of the frame where several are shown in turn.
     raw
         (H, W) recorded image; when given, it is shown in grey with the outlines of the cells.
     identities
         Track of each label: a cell then keeps its colour through the movie.
+    """
+
+    labels: IntArray
+    title: str = ""
+    raw: np.ndarray[Any, Any] | None = None
+    identities: Mapping[int, int] | None = None
+
+
+def draw_masks(
+    frames: Sequence[MaskFrame], *, shown: int = 0, pixel_size: float, units: Units
+) -> str:
+    """Draw label masks with a scale bar, as an ``<svg>`` element.
+
+    Parameters
+    ----------
+    frames
+        The frames, of equal size; with more than one the page lets the reader step through them.
+    shown
+        Which of them is seen first, in print, and without scripts.
+    pixel_size
+        Edge of a pixel, in ``units.length``.
+    units
+        Unit names, for the scale bar.
 
     Returns
     -------
     str
-        The element; the picture inside has at most `MAX_PIXELS` pixels along an edge.
+        The element; the picture inside has at most `MAX_PIXELS` pixels along an edge, the others
+        to step through at most `MAX_STEP_PIXELS`.
     """
-    height, width = labels.shape
-    step = max(1, math.ceil(max(height, width) / MAX_PIXELS))
-    seen = np.ascontiguousarray(labels[::step, ::step])
-    tones = _tones_of(seen, identities)
+    height, width = frames[shown].labels.shape
+    if len(frames) == 1:
+        body = _mask_image(frames[0], MAX_PIXELS)
+    else:
+        body = "".join(
+            _step(frame.title, _mask_image(frame, MAX_PIXELS), hidden=False)
+            if number == shown
+            else _step(frame.title, _mask_image(frame, MAX_STEP_PIXELS), hidden=True)
+            for number, frame in enumerate(frames)
+        )
+    return _framed(body, width, height, scale=1 / pixel_size, length_unit=units.length)
+
+
+def _step(title: str, image: str, *, hidden: bool) -> str:
+    display = ' display="none"' if hidden else ""
+    return f'<g class="step" data-title="{escape(title)}"{display}>{image}</g>'
+
+
+def _mask_image(frame: MaskFrame, limit: int) -> str:
+    height, width = frame.labels.shape
+    step = max(1, math.ceil(max(height, width) / limit))
+    seen = np.ascontiguousarray(frame.labels[::step, ::step])
+    tones = _tones_of(seen, frame.identities)
     inside = seen > 0
     edge = _edges(seen)
-    if raw is None:
+    if frame.raw is None:
         picture = np.dstack([tones, np.where(inside, 255, 0).astype(np.uint8)])
         picture[edge, :3] = (picture[edge, :3] * 0.55).astype(np.uint8)
         data, kind = _encode(picture, ".png"), "png"
     else:
-        grey = _to_grey(raw[::step, ::step])
+        grey = _to_grey(frame.raw[::step, ::step])
         picture = np.dstack([grey, grey, grey])
         picture[edge] = tones[edge]
         data, kind = _encode(picture, ".jpg"), "jpeg"
-    body = (
+    return (
         f'<image width="{width}" height="{height}" preserveAspectRatio="none" '
         f'href="data:image/{kind};base64,{base64.b64encode(data).decode()}"/>'
     )
-    return _framed(body, width, height, scale=1 / pixel_size, length_unit=units.length)
 
 
 def draw_contours(
