@@ -4,6 +4,7 @@ import json
 import math
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from cellquant.compare.comparison import (
     unit_mapping,
 )
 from cellquant.compare.groups import read_groups
+from cellquant.compare.results import Result
 from cellquant.compare.units import STERIC_AREA
 from cellquant.errors import InputError
 from compare_examples import make_layer
@@ -206,6 +208,33 @@ def test_study_against_sweep(study: Path, sweep: Path, tmp_path: Path) -> None:
     content = comparison.as_dict()
     assert len(content["pairs"]) == 16
     json.dumps(content, allow_nan=False)
+
+
+def test_figures_show_the_scenes_that_agree_most(movie, tmp_path: Path) -> None:
+    def scene(number: int) -> Result:
+        shape = 4.4 - 0.1 * number
+        layer = make_layer(seed=number, n_frames=3, side=5, size=80, simulated=True, shape=shape)
+        layer.summary["shape_index"]["mean"] = shape
+        layer.record["settings"] |= {"scene": {"phi": 0.9, "v0": 0.01 * (number + 1), "eta": 0.01}}
+        return layer.result(f"scene {number}")
+
+    comparison = cq.compare(movie.result("movie"), *map(scene, range(8)))
+    share = dict.fromkeys((group.name for group in comparison.simulations), 0.0)
+    for pair in comparison.as_dict()["pairs"]:
+        judged = [v for v in pair["verdicts"] if v["verdict"] != NOT_COMPARABLE]
+        agree = sum(v["verdict"] == AGREE for v in judged)
+        share[pair["second"]] += agree / len(judged) if judged else 0.0
+    assert len(set(share.values())) > 1
+    comparison.to_html(tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Simulation (6 of 8)" in page
+    data = re.search(r'download="shape-index.csv" href="data:text/csv[^,]*,([^"]*)"', page)
+    assert data is not None
+    numbers = unquote(data.group(1))
+    shown = [name for name in share if f"{name}," in numbers]
+    assert len(shown) == 6
+    hidden = [share[name] for name in share if name not in shown]
+    assert min(share[name] for name in shown) >= max(hidden)
 
 
 def test_experiments_alone_and_simulations_alone(study: Path, sweep: Path, tmp_path: Path) -> None:
