@@ -66,7 +66,7 @@ def walkers(tally: Tally, seed: int) -> None:
     tau = relaxation_time(scattering_average(paths, q))
     tally.add("tau_alpha", tau.value, tau.std_error, 1 / (diffusion * q**2), N_BLOCKS - 1)
     core = self_van_hove(paths, 3).fits
-    truth = 2 * diffusion * 3 * dt
+    truth = 4 * diffusion * 3 * dt
     tally.add("sigma2", core["sigma2"], core["sigma2_std_error"], truth, N_BLOCKS - 1)
 
 

@@ -21,16 +21,29 @@ def exponential_radius(rng: np.random.Generator, n: int, xi: float) -> np.ndarra
     return rng.gamma(2, xi, n)
 
 
-def test_gaussian_core_within_its_error_and_no_tail() -> None:
+def test_gaussian_core_within_its_error_and_no_tail_of_its_own() -> None:
+    # <r^2> = 4 D t = 0.16, half of it in each component.
     paths = from_tracks(brownian(np.random.default_rng(0), 200, 40, diffusion=0.02))
-    found = self_van_hove(paths, 2)
-    assert abs(found.fits["sigma2"] - 0.08) < 3 * found.fits["sigma2_std_error"]
-    assert found.fits["core_msd"] == pytest.approx(2 * found.fits["sigma2"])
-    reach = found.fits["core_range"][1] / np.sqrt(found.fits["sigma2"])
-    assert reach == pytest.approx(1.5, rel=0.02)
-    assert found.fits["xi"] is None
-    assert "Gaussian" in found.fits["tail_reason"]
-    assert 0.3 < found.fits["core_chi2_per_dof"] < 3
+    found = self_van_hove(paths, 2).fits
+    assert abs(found["sigma2"] - 0.16) < 3 * found["sigma2_std_error"]
+    assert found["component_variance"] == found["sigma2"] / 2
+    component = np.sqrt(found["component_variance"])
+    assert found["core_range"][1] / component == pytest.approx(1.5, rel=0.02)
+    assert 0.3 < found["core_chi2_per_dof"] < 3
+    # Nothing exceeds the Gaussian: xi is its own decay length beyond 3 standard deviations,
+    # where the mean of r is that of the truncated Gaussian.
+    assert found["tail_range"][0] == pytest.approx(3 * component)
+    assert "no exponential tail" in found["tail_note"]
+    assert found["tail_excess"] == pytest.approx(1, abs=0.4)
+    assert 0.25 < found["xi"] / component < 0.35
+
+
+def test_relaxed_gaussian_motion_has_the_published_width() -> None:
+    # F_s = exp(-q^2 <r^2>/4) = 1/e at q = 2 pi/d: sigma2 = 4/q^2 = d^2/pi^2 at tau_alpha.
+    rng = np.random.default_rng(8)
+    r = np.sqrt(rng.exponential(4 / (2 * np.pi) ** 2, size=100_000))
+    found = self_van_hove(jumps(r, rng), 1).fits
+    assert found["sigma2"] == pytest.approx(0.1013, rel=0.02)
 
 
 def test_exponential_tail_within_its_error() -> None:
@@ -63,7 +76,7 @@ def test_two_populations() -> None:
     assert automatic["xi_std_error"] < 0.02 * 0.25
     assert automatic["tail_chi2_per_dof"] < 2
     # The jumpers make the core a little broader: the stated bias, positive and small.
-    assert 0.01 < automatic["sigma2"] < 0.0115
+    assert 0.01 < automatic["component_variance"] < 0.0115
 
 
 def test_both_normalisations() -> None:

@@ -322,8 +322,8 @@ def _distribution(group: Group, table: str, x: str) -> Distribution:
         core = scalars.get("van_hove.sigma2")
         error = math.nan
         if core is not None and core.value > 0:
-            # The mean of r is sqrt(pi/2) sigma for the Gaussian core.
-            error = math.sqrt(math.pi / 8) * core.std_error / math.sqrt(core.value)
+            # The mean of r is sqrt(pi sigma2)/2 for the core exp(-r^2/sigma2).
+            error = math.sqrt(math.pi) / 4 * core.std_error / math.sqrt(core.value)
     else:
         mean = scalars.get("shape_index.mean")
         error = mean.std_error if mean is not None else math.nan

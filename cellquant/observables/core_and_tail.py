@@ -12,12 +12,21 @@ from cellquant.observables.smoothing import FloatArray, IntArray
 
 CORE_REACH = 1.5  # the core ends at this many standard deviations
 TAIL_EXCESS = 10.0  # the tail begins where it holds this many times what the core predicts
+GAUSSIAN_TAIL = 3.0  # where it never does, at this many standard deviations: 1.1 % of a Gaussian
 MIN_COUNT = 30
+STANDS_OUT = f"from where it holds {TAIL_EXCESS:g} times what the core predicts"
+END_OF_CORE = (
+    f"from {GAUSSIAN_TAIL:g} standard deviations of one component of the core, beyond which "
+    f"nowhere {TAIL_EXCESS:g} times what the core predicts is found"
+)
 Range = tuple[float, float]
 
 
 class Core(NamedTuple):
-    """Fit of exp(-r^2/(2 sigma2)) per area on [low, high], with the displacements inside."""
+    """Fit of exp(-r^2/sigma2) per area on [low, high], with the displacements inside.
+
+    sigma2 is the mean of r^2, twice the variance of one component.
+    """
 
     low: float
     high: float
@@ -25,25 +34,35 @@ class Core(NamedTuple):
     sigma2: float
     reason: str | None = None
 
+    @property
+    def component(self) -> float:
+        """Standard deviation of one component."""
+        return float(np.sqrt(self.sigma2 / 2))
+
     def beyond(self, r: Any) -> Any:
         """Displacements longer than r that the fit predicts."""
-        return self.n / self.share * np.exp(-(np.asarray(r) ** 2) / (2 * self.sigma2))
+        return self.n / self.share * np.exp(-(np.asarray(r) ** 2) / self.sigma2)
 
     @property
     def share(self) -> float:
         """Share of the fitted law that lies inside the range."""
-        twice = 2 * self.sigma2
-        return float(np.exp(-(self.low**2) / twice) - np.exp(-(self.high**2) / twice))
+        inside = np.exp(-(self.low**2) / self.sigma2) - np.exp(-(self.high**2) / self.sigma2)
+        return float(inside)
 
 
 class Tail(NamedTuple):
-    """Fit of exp(-r/xi) per area on [low, high]; n_core of the n inside belong to the core."""
+    """Fit of exp(-r/xi) per area on [low, high]; n_core of the n inside belong to the core.
+
+    ``excess`` is how many times what the core predicts the range holds, NaN without a core.
+    """
 
     low: float
     high: float
     n: int
     n_core: float
     xi: float
+    rule: str
+    excess: float = float("nan")
     reason: str | None = None
 
 
@@ -76,9 +95,9 @@ def fit_core_and_tail(
 ) -> tuple[Core, float, Tail, float]:
     r"""Fit the core and the tail of a distribution of displacement lengths.
 
-    The core is ``exp(-r^2/(2 sigma^2))`` and the tail ``exp(-r/xi)``, both per area, both by
-    maximum likelihood inside their range, so that no bin enters. Of an automatic tail the
-    displacements that the core predicts there are taken out first.
+    The core is ``exp(-r^2/sigma2)`` and the tail ``exp(-r/xi)``, both per area, both by maximum
+    likelihood inside their range, so that no bin enters. Of a tail that stands out from the core
+    the displacements that the core predicts there are taken out first.
 
     Parameters
     ----------
@@ -89,10 +108,12 @@ def fit_core_and_tail(
     n_blocks
         Number of blocks.
     core_range
-        From 0 to 1.5 sigma, found in four steps from the median, when None.
+        From 0 to 1.5 standard deviations of a component, found in four steps from the median,
+        when None.
     tail_range
-        From where it holds ten times what the core predicts, at least 2 sigma, to infinity when
-        None.
+        From where it holds ten times what the core predicts, at least 2 standard deviations, to
+        infinity when None; where it nowhere does, from 3 standard deviations on, and xi is then
+        the local decay length of the core itself.
 
     Returns
     -------
@@ -105,7 +126,7 @@ def fit_core_and_tail(
 
     Undefined (NaN with a reason)
         The core, with fewer than 30 lengths in its range or when they do not fall off; the tail
-        likewise, and when no range holds ten times what the core predicts.
+        likewise.
     """
     order = np.argsort(r, kind="stable")
     r, block = r[order], block[order]
@@ -132,15 +153,15 @@ def _fit_core(lengths: _Lengths, given: Range | None) -> Core:
         high = CORE_REACH * float(lengths.r[lengths.r.size // 2]) / np.sqrt(2 * np.log(2))
         for _ in range(3):
             n, _, squares = lengths.between(0.0, high)
-            sigma2 = _truncated_scale(squares / max(n, 1), 0.0, high**2) / 2
+            sigma2 = _truncated_scale(squares / max(n, 1), 0.0, high**2)
             if not np.isfinite(sigma2):
                 break
-            high = CORE_REACH * float(np.sqrt(sigma2))
+            high = CORE_REACH * float(np.sqrt(sigma2 / 2))
     n, _, squares = lengths.between(low, high)
     if n < MIN_COUNT:
         few = f"fewer than {MIN_COUNT} displacements lie in the core"
         return Core(low, high, n, float("nan"), few)
-    sigma2 = _truncated_scale(squares / n, low**2, high**2) / 2
+    sigma2 = _truncated_scale(squares / n, low**2, high**2)
     reason = None if np.isfinite(sigma2) else "the core does not fall off inside its range"
     return Core(low, high, n, sigma2, reason)
 
@@ -160,35 +181,38 @@ def _truncated_scale(mean: float, low: float, high: float) -> float:
 
 def _fit_tail(lengths: _Lengths, given: Range | None, core: Core) -> Tail:
     nan = float("nan")
-    if given is None and not np.isfinite(core.sigma2):
+    known = bool(np.isfinite(core.sigma2))
+    if given is not None:
+        (low, high), rule = given, "given"
+    elif not known:
         unknown = "the tail is placed by the width of the core, which is not known"
-        return Tail(nan, nan, 0, 0.0, nan, unknown)
-    low, high = given or (_tail_start(lengths, core), np.inf)
-    if not np.isfinite(low):
-        nowhere = (
-            f"nowhere does the distribution hold {TAIL_EXCESS:g} times what its Gaussian core "
-            f"predicts, with {MIN_COUNT} displacements beyond"
-        )
-        return Tail(nan, nan, 0, 0.0, nan, nowhere)
+        return Tail(nan, nan, 0, 0.0, nan, "none", reason=unknown)
+    else:
+        low, rule = _tail_start(lengths, core)
+        high = float("inf")
     n, total, _ = lengths.between(low, high)
+    predicted = float(core.beyond(low) - core.beyond(high)) if known else nan
+    excess = n / predicted if predicted > 0 else nan
     if n < MIN_COUNT:
         few = f"fewer than {MIN_COUNT} displacements lie in the tail"
-        return Tail(low, high, n, 0.0, nan, few)
+        return Tail(low, high, n, 0.0, nan, rule, excess, few)
     n_core = 0.0
-    if given is None:
-        n_core = float(core.beyond(low))
-        total -= n_core * _rayleigh_mean(low, float(np.sqrt(core.sigma2)))
+    if rule == STANDS_OUT:
+        n_core = predicted
+        total -= n_core * _rayleigh_mean(low, core.component)
     xi = _tail_length(total / (n - n_core), low, high)
     reason = None if np.isfinite(xi) else "the tail does not fall off inside its range"
-    return Tail(low, high, n, n_core, xi, reason)
+    return Tail(low, high, n, n_core, xi, rule, excess, reason)
 
 
-def _tail_start(lengths: _Lengths, core: Core) -> float:
-    """First r, in tenths of sigma from two on, beyond which the core explains a tenth at most."""
-    places = np.sqrt(core.sigma2) * (2 + 0.1 * np.arange(61))
+def _tail_start(lengths: _Lengths, core: Core) -> tuple[float, str]:
+    """First r, in tenths of a standard deviation from two on, that the core does not explain."""
+    places = core.component * (2 + 0.1 * np.arange(61))
     beyond = lengths.r.size - np.searchsorted(lengths.r, places)
     good = np.flatnonzero((beyond >= TAIL_EXCESS * core.beyond(places)) & (beyond >= MIN_COUNT))
-    return float(places[good[0]]) if good.size else float("inf")
+    if good.size:
+        return float(places[good[0]]), STANDS_OUT
+    return GAUSSIAN_TAIL * core.component, END_OF_CORE
 
 
 def _rayleigh_mean(low: float, sigma: float) -> float:

@@ -56,17 +56,18 @@ def neighbours(context: Context, out: Results) -> None:
 
 
 def van_hove(context: Context, out: Results) -> None:
-    from cellquant.observables.vanhove import NORMALISATIONS, self_van_hove
+    from cellquant.observables.vanhove import CORE_FORM, NORMALISATIONS, TAIL_FORM, self_van_hove
 
     lag_time, reason, source = _van_hove_lag(context)
     d = context.diameter["mean_diameter"]
     entry: dict[str, Any] = {
         "lag_time": lag_time, "lag_rule": source,
-        "sigma2": None, "sigma2_std_error": None, "xi": None, "xi_std_error": None,
+        "sigma2": None, "sigma2_std_error": None, "component_variance": None,
+        "component_variance_std_error": None, "xi": None, "xi_std_error": None,
+        "core_form": CORE_FORM, "tail_form": TAIL_FORM,
         "normalisation": NORMALISATIONS, "core_range": None, "tail_range": None,
         "length_unit": "mean diameter" if d else context.source.units.length,
         "length_in_table_unit": d or 1.0,
-        "sigma2_meaning": "variance of one component: the core is exp(-r^2/(2 sigma^2))",
     }  # fmt: skip
     if lag_time is None:
         out.summary["van_hove"] = {**entry, "reason": reason}

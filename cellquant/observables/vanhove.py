@@ -11,7 +11,7 @@ from cellquant.observables.blocks import (
     leave_one_out,
     spatial_blocks,
 )
-from cellquant.observables.core_and_tail import Core, Tail, fit_core_and_tail
+from cellquant.observables.core_and_tail import END_OF_CORE, Core, Tail, fit_core_and_tail
 from cellquant.observables.smoothing import FloatArray, IntArray
 from cellquant.observables.trajectories import Trajectories
 
@@ -19,6 +19,11 @@ NORMALISATIONS = {
     "areal": "2 pi int G_s r dr = 1: probability per area",
     "unit_integral": "int G_s dr = 1: the form of the source, prefactor 1/(2 pi r) kept",
 }
+CORE_FORM = (
+    "exp(-r^2/sigma2): sigma2 is the mean-square displacement of the core, twice the variance of "
+    "one component"
+)
+TAIL_FORM = "exp(-r/xi), as a density per area"
 
 
 @dataclass(frozen=True)
@@ -75,9 +80,11 @@ def self_van_hove(
     """Self part of the van Hove function, with fits of core and tail.
 
     ``G_s(r, t) = < delta(r - |dr|) > / (2 pi r)``, in rings. The core is fitted with
-    ``exp(-r^2/(2 sigma^2))`` and the tail with ``exp(-r/xi)``, both as densities per area and by
-    maximum likelihood of the displacements inside the range, so that no bin enters. Errors: the
-    fits, with their choice of ranges, without each block of tracks in turn.
+    ``exp(-r^2/sigma2)`` and the tail with ``exp(-r/xi)``, both as densities per area and by
+    maximum likelihood of the displacements inside the range, so that no bin enters. sigma2 is
+    thus the mean-square displacement of the core, twice the variance of one component, which is
+    given as ``component_variance``. Errors: the fits, with their choice of ranges, without each
+    block of tracks in turn.
 
     Parameters
     ----------
@@ -88,20 +95,21 @@ def self_van_hove(
     unit
         Length in which r is expressed, e.g. the mean cell diameter.
     core_range
-        Range of r, in the unit; from 0 to 1.5 sigma, found in four steps from the median,
-        when None.
+        Range of r, in the unit; from 0 to 1.5 standard deviations of one component, found in
+        four steps from the median, when None.
     tail_range
         Range of r, in the unit; from where it holds ten times what the core predicts, at
-        least 2 sigma, to the largest displacement when None.
+        least 2 standard deviations, to the largest displacement when None; where it nowhere
+        does, from 3 standard deviations on.
 
     Returns
     -------
     VanHove
-        No core when nothing moves; no tail where no range holds ten times what the core
-        predicts and 30 displacements (the distribution is Gaussian as far as it is known).
-        Up to a tenth of an automatic tail belongs to the core: what the fitted core predicts
-        there is taken out before xi is fitted (a range that is given is fitted as it is).
-        Bias: a broad tail reaches into the core's range and makes sigma larger; where the decay
+        No core when nothing moves; no tail with fewer than 30 displacements in its range. Up to a
+        tenth of a tail that stands out belongs to the core: what the fitted core predicts there
+        is taken out before xi is fitted (a range that is given is fitted as it is). Where none
+        stands out xi is the local decay length of the core, and ``tail_note`` says so.
+        Bias: a broad tail reaches into the core's range and makes sigma2 larger; where the decay
         is hardly longer than the core is wide, xi comes out short by a tenth and more.
 
     References
@@ -118,7 +126,8 @@ def self_van_hove(
     r = np.hypot(dx, dy) / unit
     fits: dict[str, Any] = {
         "n": int(r.size),
-        "sigma2": None, "sigma2_std_error": None, "core_range": None, "core_chi2_per_dof": None,
+        "sigma2": None, "sigma2_std_error": None, "component_variance": None,
+        "component_variance_std_error": None, "core_range": None, "core_chi2_per_dof": None,
         "xi": None, "xi_std_error": None, "tail_range": None, "tail_chi2_per_dof": None,
         "std_error_method": blocks.method,
     }  # fmt: skip
@@ -145,11 +154,19 @@ def _describe(
     if core.reason is not None:
         found["core_reason"] = core.reason
     else:
-        found.update(sigma2=core.sigma2, sigma2_std_error=sigma2_error, core_msd=2 * core.sigma2)
+        found.update(sigma2=core.sigma2, sigma2_std_error=sigma2_error)
+        found.update(component_variance=core.sigma2 / 2)
+        found.update(component_variance_std_error=sigma2_error / 2)
         found.update(core_range=[core.low, core.high], core_n=core.n)
     if tail.n:
         found["tail_range"] = [tail.low, min(tail.high, longest)]
-        found.update(tail_n=tail.n, tail_core_n=tail.n_core)
+        found.update(tail_n=tail.n, tail_core_n=tail.n_core, tail_excess=tail.excess)
+        found["tail_rule"] = tail.rule
+    if tail.rule == END_OF_CORE and tail.reason is None:
+        found["tail_note"] = (
+            "no exponential tail stands out from the core; xi is the local decay length of the "
+            "core where it ends"
+        )
     if tail.reason is not None:
         found["tail_reason"] = tail.reason
     else:
@@ -160,15 +177,15 @@ def _describe(
 def _histogram(
     r: FloatArray, block: IntArray, n: int, core: Core | None, tail: Tail | None
 ) -> pd.DataFrame:
-    """Rings a fifth of sigma wide (at most 400), with both normalisations and both fits."""
+    """Rings a fifth of a component's width wide (at most 400), both normalisations and fits."""
     names = (
         "r", "value", "std_error", "unit_integral", "unit_integral_std_error", "gaussian",
         "exponential",
     )  # fmt: skip
     if r.size == 0 or not r.max() > 0:
         return pd.DataFrame({**{k: np.empty(0) for k in names}, "n": np.empty(0, np.int64)})
-    sigma2 = core.sigma2 if core is not None else float(np.mean(r * r) / 2)
-    n_bins = int(np.clip(np.ceil(r.max() / (0.2 * np.sqrt(sigma2))), 10, 400))
+    sigma2 = core.sigma2 if core is not None else float(np.mean(r * r))
+    n_bins = int(np.clip(np.ceil(r.max() / (0.2 * np.sqrt(sigma2 / 2))), 10, 400))
     edges = np.linspace(0, float(r.max()), n_bins + 1)
     width = edges[1]
     ring = np.minimum((r / width).astype(np.int64), n_bins - 1)
@@ -201,8 +218,8 @@ def _histogram(
         }
     )
     if core is not None:
-        level = core.beyond(0.0) / r.size / (2 * np.pi * sigma2)
-        table["gaussian"] = level * np.exp(-(centre**2) / (2 * sigma2))
+        level = core.beyond(0.0) / r.size / (np.pi * sigma2)
+        table["gaussian"] = level * np.exp(-(centre**2) / sigma2)
     if tail is not None:
         xi, low, high = tail.xi, tail.low, min(tail.high, float(r.max()))
         mass = xi * ((low + xi) - (high + xi) * np.exp((low - high) / xi))
