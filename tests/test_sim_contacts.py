@@ -222,10 +222,6 @@ def test_shapes_that_are_none_are_refused():
     assert caught.value.cell == 1
     assert caught.value.remedy
     layer, state = pair(3.0)
-    state[0, 3] = 0.9
-    with pytest.raises(SimulationFailure, match="crosses itself"):
-        velocity(layer, state)
-    layer, state = pair(3.0)
     velocity(layer, state)
     state[1, 0] = np.nan
     with pytest.raises(SimulationFailure, match="finite"):

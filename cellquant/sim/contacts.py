@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cellquant.errors import InputError
-from cellquant.sim import kernels, stiffness
+from cellquant.sim import kernels, pinches, stiffness
 from cellquant.sim.scene import Scene, SimulationFailure
 
 Floats = NDArray[np.float64]
 ContactRule = Literal["exact", "quadrature"]
+NONE = np.empty(0, np.int64)
+PINCHED = 0.02  # smallest sample of a contour over R0 below which its zeros are sought
 
 
 def exact_samples(modes: int) -> int:
@@ -103,8 +105,7 @@ class Layer:
         Raises
         ------
         SimulationFailure
-            If a contour is not representable (a0^2 <= 0), crosses itself (R <= 0), or a number is
-            not finite.
+            If a contour is not representable (a0^2 <= 0), or a number is not finite.
         """
         self.evaluations += 1
         self._prepare(state, self._tension if self.contact == "exact" else ())
@@ -196,14 +197,15 @@ class Layer:
         )
 
     def age_of_list(self) -> Floats:
-        """Centres and reach (N, 3) for which the neighbour list was made."""
+        """Centres, reach and lowest radius (N, 4) for which the neighbour list was made."""
         if self._reference is None:
             raise ValueError("the layer has not been evaluated yet")
         return self._reference
 
     def restore_list(self, reference: Floats) -> None:
         """Make the neighbour list as it was, so that sums keep their order after a restart."""
-        self._record[:, [0, 1, 3]] = reference
+        self._record[:, [0, 1, 3]] = reference[:, :3]
+        self._lowest[:] = reference[:, 3]
         self._rebuild()
 
     def _prepare(self, state: Floats, tension: tuple[int, ...]) -> None:
@@ -223,25 +225,27 @@ class Layer:
                 self._tangent,
                 self._lowest,
             )
-        if self._reference is None:
-            self._check(kernels.inspect(self._record, self._lowest, self._record[:, [0, 1, 3]])[1])
+        fresh = self._reference is None
+        reference = self._record[:, [0, 1, 3]] if self._reference is None else self._reference
+        age, fault, narrowest = kernels.inspect(self._record, self._lowest, reference)
+        self._check(fault)
+        self._narrow = (
+            np.flatnonzero(self._lowest < pinches.NARROW * self.radius)
+            if narrowest < 2.0 * pinches.NARROW and not self.scene.rigid
+            else NONE
+        )
+        if len(self._narrow) and tension:
+            pinches.measure_lengths(self._record, self._narrow, len(self._modes), self._tangent)
+        if fresh or age > 0.5 * self.skin:
             self._rebuild()
-        else:
-            age, fault = kernels.inspect(self._record, self._lowest, self._reference)
-            self._check(fault)
-            if age > 0.5 * self.skin:
-                self._rebuild()
 
     def _check(self, fault: int) -> None:
         if fault < 0:
             return
         row = self._record[fault]
-        if math.isnan(self._lowest[fault]):
+        reason = "the state is not finite"
+        if np.isfinite(row[:2]).all() and np.isfinite(row[kernels.HEAD :]).all():
             reason = "the contour is no longer representable (a0^2 <= 0)"
-        elif not np.isfinite(row).all():
-            reason = "the state is not finite"
-        else:
-            reason = "the contour crosses itself (R <= 0)"
         raise SimulationFailure(
             reason,
             "take a smaller step or the adaptive integrator, a larger eta, or a smaller v0 or phi",
@@ -264,18 +268,34 @@ class Layer:
                 )
             self._capacity = int(needed[0])
         self._first, self._other, self._shift = first, other.copy(), shift.copy()
+        self._put_narrow_first()
         back = kernels.transpose_pairs(self._first, self._other)
         self._back_first, self._back_pair, self._back_cell = back
         self._root_first = np.zeros(len(self._other), np.int64)
         self._root_last = np.zeros(len(self._other), np.int64)
         self._inside = np.zeros(len(self._other), np.int8)
-        self._reference = np.ascontiguousarray(self._record[:, [0, 1, 3]])
+        self._reference = np.column_stack([self._record[:, [0, 1, 3]], self._lowest])
         self.builds += 1
 
-    def _allocate_roots(self, room: int) -> None:
-        size = self._n_blocks * room
-        self._roots = np.zeros((size, kernels.ROOT))
-        self._sign = np.zeros(size)
+    def _put_narrow_first(self) -> None:
+        """Turn the listed pairs so that crossings are sought on the contour with the waist."""
+        waist = self._lowest / self.radius
+        if not waist.min() < pinches.NARROW:
+            return
+        waist[waist > pinches.NARROW] = 1.0
+        cell = np.repeat(np.arange(len(waist)), np.diff(self._first))
+        turned = waist[self._other] < waist[cell]
+        sign = np.where(turned, -1.0, 1.0)
+        first, second = np.where(turned, (self._other, cell), (cell, self._other))
+        order = np.argsort(first, kind="stable")
+        self._other = second[order]
+        self._shift = (sign[:, None] * self._shift)[order]
+        self._first = np.searchsorted(first[order], np.arange(len(waist) + 1))
+
+    def _allocate_roots(self, room: int, spare: int = 0) -> None:
+        self._room = self._n_blocks * room
+        self._roots = np.zeros((self._room + spare, kernels.ROOT))
+        self._sign = np.zeros(self._room + spare)
 
     def _find_crossings(self) -> None:
         while True:
@@ -290,13 +310,37 @@ class Layer:
                 self._other,
                 self._shift,
                 self._modes,
+                self._roots[: self._room],
+                self._root_first,
+                self._root_last,
+                self._sign[: self._room],
+                self._inside,
+                fault,
+            )
+            if fault.any():
+                self._allocate_roots(2 * self._room // self._n_blocks)
+            elif (used := self._close_pinches()) > len(self._roots):
+                self._allocate_roots(self._room // self._n_blocks, 2 * (used - self._room))
+            else:
+                return
+
+    def _close_pinches(self) -> int:
+        """End the arcs of pinched contours where they reach the centre; return the room used."""
+        pinched = self._lowest < PINCHED * self.radius
+        if len(self._narrow) == 0 or not pinched.any():
+            return 0
+        return int(
+            pinches.add_gaps(
+                self._record,
+                pinched,
+                self._first,
+                self._other,
                 self._roots,
                 self._root_first,
                 self._root_last,
                 self._sign,
                 self._inside,
-                fault,
+                self._room,
+                len(self._modes),
             )
-            if not fault.any():
-                return
-            self._allocate_roots(2 * len(self._roots) // self._n_blocks)
+        )

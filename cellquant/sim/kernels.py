@@ -392,6 +392,7 @@ def facing(
     if distance <= 1e-9 * nearest:
         return 0.0, 2.0 * math.pi / spacing
     inverse = 1.0 / distance
+    nearest = max(nearest, 1e-6 * high_i)  # a pinched contour comes as near as its centre
     angle = acos_bound(0.5 * (away + nearest * nearest) * inverse / nearest)
     middle = acos_bound(dx * inverse)
     return (middle if dy >= 0.0 else -middle) / spacing, 2.0 * angle / spacing
@@ -1108,7 +1109,8 @@ def quadrature_velocity(
                     depth = mean_j + pr * (ux * ux - uy * uy) - pi * (2.0 * ux * uy)
                     held[offset + s] += 1.0 if depth > q * inverse else 0.0
             for s in range(size):
-                held[s] += held[size + s]
+                # Directions in which the cell has no extent hold nothing: see `pinches`.
+                held[s] = held[s] + held[size + s] if rho[i, s] > 0.0 else 0.0
             fx = 0.0
             fy = 0.0
             spin = 0.0
@@ -1226,19 +1228,22 @@ def rigid_velocity(
 
 
 @njit(cache=True)
-def inspect(record: Any, lowest: Any, reference: Any) -> tuple[float, int]:
-    """How far the neighbour list has aged, and the first cell whose contour is not one.
+def inspect(record: Any, lowest: Any, reference: Any) -> tuple[float, int, float]:
+    """How far the neighbour list has aged, the first faulty cell, and the smallest radius.
 
     The age is the largest sum of displacement and growth of the reach since the list was made.
-    The cell is -1 where every contour has rho > 0; NaN counts as a fault.
+    The cell is -1 where every number is finite. The smallest radius is that of the sharpest waist
+    in units of its A0.
     """
     age = 0.0
     fault = -1
+    narrowest = 1.0
     for i in range(record.shape[0]):
-        if not (lowest[i] > 0.0 and math.isfinite(record[i, 0] + record[i, 1] + record[i, 3])):
+        if not math.isfinite(lowest[i] + record[i, 0] + record[i, 1] + record[i, 3]):
             fault = i
             break
         dx = record[i, 0] - reference[i, 0]
         dy = record[i, 1] - reference[i, 1]
         age = max(age, math.sqrt(dx * dx + dy * dy) + record[i, 3] - reference[i, 2])
-    return age, fault
+        narrowest = min(narrowest, lowest[i] / record[i, 2])
+    return age, fault, narrowest

@@ -97,7 +97,8 @@ def draw(
                 for m in range(n_modes):
                     zr, zi = zr * c - zi * s, zr * s + zi * c
                     bound += re[m] * zr - im[m] * zi
-                ratio = r / (radius[i] * bound)
+                # A pinched cell has no extent where its radius is not positive.
+                ratio = r / (radius[i] * bound) if bound > 0.0 else HALO
                 if ratio < nearest[row, column]:
                     nearest[row, column] = ratio
                     if ratio < 1.0:

@@ -33,8 +33,12 @@ def contour_radii(
 def contours(
     position: Floats, modes: Floats, polarity: Floats, radius: Floats, points: int = 128
 ) -> Floats:
-    """Contour points of every cell, (N, points, 2), counter-clockwise."""
+    """Contour points of every cell, (N, points, 2), counter-clockwise.
+
+    A pinched cell has no extent where R <= 0: its points stand at the centre there.
+    """
     rho, _ = contour_radii(modes, polarity, radius, points)
+    rho = np.maximum(rho, 0.0)
     angle = 2.0 * math.pi * np.arange(points) / points
     around = np.stack([rho * np.cos(angle), rho * np.sin(angle)], axis=2)
     return around + position[:, None, :]
@@ -42,6 +46,9 @@ def contours(
 
 def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFrame:
     r"""Area, perimeter and axes of every contour by the trapezoid rule, which is spectral here.
+
+    Of a pinched cell (R < 0 somewhere, see `pinches`) the perimeter is the length of the whole
+    Fourier contour, as in the energy, and the area pi R0^2, as the model keeps it.
 
     .. math:: P = \int \sqrt{\rho^2 + \rho'^2}\, d\phi, \qquad p = P / \sqrt{A}
 

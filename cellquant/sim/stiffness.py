@@ -70,6 +70,8 @@ def gather(
     for i in range(state.shape[0]):
         for p in range(first[i], first[i + 1]):
             for r in range(root_first[p], root_last[p]):
+                if roots[r, 4] == 0.0 or roots[r, 5] == 0.0:
+                    continue  # an arc that ends at the centre of a pinched cell, no crossing
                 if count < room:
                     j = other[p]
                     ax, ay, turn_i = normal_displacement(
