@@ -18,6 +18,7 @@ from cellquant.sim.noise import BrownianTree
 from cellquant.tables import REDUCED, TRACK_COLUMNS
 
 SMALL = Scene(n_cells=9, phi=0.9)
+DRAWN_OUT = Scene(n_cells=9, phi=1.0, v0=0.3, eta=0.0, mu_ab=1.0)  # fast cells without tension
 
 
 def same(a, b):
@@ -341,3 +342,69 @@ def test_extreme_scenes_end_with_an_answer_or_a_refusal():
             assert found["error"] < limit, name
         else:
             assert ";" in found["outcome"], name
+
+
+def test_a_step_that_fails_is_taken_in_parts_on_the_same_path(monkeypatch):
+    from cellquant.sim.contacts import Layer
+    from cellquant.sim.initial import initial_state
+    from cellquant.sim.integrators import METHODS, Euler, Method
+
+    class Fragile(Euler):
+        def step(self, state, h, w, area):
+            if h > 0.015:
+                state += 1.0  # what a failing method leaves behind must not matter
+                raise SimulationFailure("too long", "none")
+            super().step(state, h, w, area)
+
+    monkeypatch.setitem(METHODS, "fragile", Method(Fragile, 0.02))
+    run = simulate(SMALL, duration=2, integrator="fragile", dt=0.02)
+    assert run.work["repaired"] == run.work["rejected"] == run.work["steps"] == 100
+    state, radius, box = initial_state(SMALL)
+    euler = Euler(Layer(SMALL, radius, box))
+    tree = BrownianTree(SMALL.seed, 9, 0.08)
+    for root in range(25):
+        for w, area in zip(*tree.level(root, 3), strict=True):
+            euler.step(state, 0.01, w, area)
+    assert np.array_equal(run.state(-1), state)
+
+    class Broken(Euler):
+        def step(self, state, h, w, area):
+            raise SimulationFailure("broken", "mend it", cell=3)
+
+    monkeypatch.setitem(METHODS, "broken", Method(Broken, 0.02))
+    with pytest.raises(SimulationFailure, match=r"broken even at a step of 0\.0003") as caught:
+        simulate(SMALL, duration=2, integrator="broken", dt=0.02)
+    assert caught.value.cell == 3
+    assert caught.value.remedy == "mend it"
+
+
+def test_a_run_goes_on_past_a_pinched_cell_and_says_so(tmp_path, monkeypatch):
+    from cellquant.cli.text import run_lines
+    from cellquant.sim.shapes import pinched
+
+    monkeypatch.setattr(run_module, "CHECKPOINT_EVERY", 0.0)
+
+    class Stop(Exception):
+        pass
+
+    def stop(done, total):
+        if done == 11:
+            raise Stop
+
+    path = tmp_path / "run.zarr"
+    with pytest.raises(Stop):
+        simulate(DRAWN_OUT, duration=12, output=path, progress=stop)
+    run = simulate(DRAWN_OUT, duration=12, output=path)
+    same(run, simulate(DRAWN_OUT, duration=12))
+    closed = [pinched(run.modes[t], run.polarity[t], run.radius).sum() for t in range(13)]
+    assert sum(closed) > 0
+    assert run.work["pinched_cells"] >= 1
+    assert run.work["pinched_share"] == pytest.approx(sum(closed) / 12 / 9)
+    assert any(line.startswith("pinched: ") for line in run_lines(run))
+
+
+def test_a_shape_that_is_none_stops_with_the_partial_run():
+    with pytest.raises(SimulationFailure, match=r"a0\^2 <= 0.* even at a step") as caught:
+        simulate(DRAWN_OUT, duration=30)
+    assert caught.value.run.n_frames > 10
+    assert np.isfinite(caught.value.run.modes).all()

@@ -107,15 +107,27 @@ def run_lines(run: "Run") -> list[str]:
     from cellquant.errors import InputError
 
     scene, settings, work = run.scene, run.settings, run.work
+    pace = (
+        f"step {settings['dt']:g} t0"
+        if settings["tolerance"] is None
+        else f"tolerance {settings['tolerance']:g} L0"
+    )
     lines = [
         f"scene: {scene.n_cells} cells, phi {scene.phi:g}, v0 {scene.v0:g}, eta {scene.eta:g}",
         f"box: {run.box[0]:.4f} x {run.box[1]:.4f} L0",
-        f"scheme: {settings['integrator']}, step {settings['dt']:g} t0, "
-        f"{settings['contact']} contacts",
+        f"scheme: {settings['integrator']}, {pace}, {settings['contact']} contacts",
         f"saved: {run.n_frames} states, one every {settings['save_every']:g} t0, "
         f"after {settings['transient']:g} t0",
     ]
-    lines += [f"{name.replace('_', ' ')}: {value:.6g}" for name, value in sorted(work.items())]
+    shown = {k: v for k, v in sorted(work.items()) if not k.startswith(("pinched", "repaired"))}
+    lines += [f"{name.replace('_', ' ')}: {value:.6g}" for name, value in shown.items()]
+    if work.get("repaired"):
+        lines.append(f"repaired: {work['repaired']} steps that failed were taken in parts")
+    if work.get("pinched_cells"):
+        lines.append(
+            f"pinched: {work['pinched_cells']} cells reached R <= 0 at their waist, "
+            f"{100 * work['pinched_share']:.2g} % of all cells and times"
+        )
     try:
         found = run.stationarity()
     except InputError as error:

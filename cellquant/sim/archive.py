@@ -173,7 +173,12 @@ class Run:
 
     @property
     def work(self) -> dict[str, Any]:
-        """Steps, force evaluations, rejected steps and seconds of CPU time spent."""
+        """What the run took, and what was out of the ordinary.
+
+        steps, rejected (given up) and repaired (taken in parts) steps, force evaluations,
+        cpu_seconds; pinched_cells: cells that ended some frame interval with R <= 0 somewhere,
+        the transient included, and pinched_share: their share of all cells and intervals.
+        """
         return dict(self._group.attrs.get("work", {}))
 
     @property

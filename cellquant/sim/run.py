@@ -25,6 +25,7 @@ from cellquant.sim.contacts import ContactRule, Layer
 from cellquant.sim.initial import initial_state
 from cellquant.sim.integrators import find_method, recommended
 from cellquant.sim.scene import Scene, SimulationFailure
+from cellquant.sim.shapes import pinched
 from cellquant.sim.steps import AdaptiveSteps, FixedSteps, Plan
 
 Floats = NDArray[np.float64]
@@ -88,8 +89,8 @@ def simulate(
     InputError
         If an option is wrong, or `output` holds something else.
     SimulationFailure
-        If the run cannot go on: a step too long, a contour that is none. The exception carries
-        the partial run, the step, the cell and the remedy.
+        If the run cannot go on: a step too long even in 64 parts, a contour that is none. The
+        exception carries the partial run, the step, the cell and the remedy.
     """
     if seed is not None:
         scene = scene.replace(seed=seed)
@@ -168,6 +169,7 @@ class _Simulation:
             self.steps = AdaptiveSteps(self.layer, plan, settings["tolerance"])
         self.interval = 0  # frame intervals done, those of the transient included
         self.cpu = 0.0
+        self.pinched = np.zeros(len(radius), np.int64)  # frame intervals each cell ended pinched
         self.buffer: list[tuple[float, Floats]] = []
         stored = self._resume()
         if stored is None:
@@ -209,6 +211,7 @@ class _Simulation:
             self.interval = int(stored["interval"])
             self.written = int(stored["written"])
             self.cpu = float(stored["cpu"])
+            self.pinched = stored["pinched"]
             self.layer.evaluations = int(stored["evaluations"])
             self.layer.builds = int(stored["builds"])
             if len(stored["reference"]):
@@ -235,6 +238,7 @@ class _Simulation:
                     break
                 self.steps.advance(self.state, self.interval)
                 self.interval += 1
+                self._count_pinched()
                 if progress is not None:
                     progress(round(self.interval * frame_interval), round(total))
                 now = time.monotonic()
@@ -273,6 +277,11 @@ class _Simulation:
         self.group.attrs.update({"status": "failed", "failure": record})
         return told
 
+    def _count_pinched(self) -> None:
+        if not self.scene.rigid:
+            modes = self.state[:, 3:].reshape(len(self.state), 2, -1)
+            self.pinched += pinched(modes, self.state[:, 2], self.layer.radius)
+
     def _write_frames(self) -> None:
         if self.buffer:
             times = np.array([t for t, _ in self.buffer])
@@ -282,8 +291,11 @@ class _Simulation:
         self.group.attrs["work"] = {
             "steps": self.steps.count,
             "rejected": self.steps.rejected,
+            "repaired": self.steps.repaired,
             "evaluations": self.layer.evaluations,
             "cpu_seconds": self.cpu,
+            "pinched_cells": int(np.count_nonzero(self.pinched)),
+            "pinched_share": float(self.pinched.mean() / max(1, self.interval)),
         }
 
     def _write(self) -> None:
@@ -297,6 +309,7 @@ class _Simulation:
             interval=self.interval,
             written=self.written,
             cpu=self.cpu,
+            pinched=self.pinched,
             evaluations=self.layer.evaluations,
             builds=self.layer.builds,
             reference=reference,

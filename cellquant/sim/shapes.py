@@ -30,6 +30,17 @@ def contour_radii(
     return rho * radius[:, None], slope * radius[:, None]
 
 
+def pinched(modes: Floats, polarity: Floats, radius: Floats) -> NDArray[np.bool_]:
+    """(N,) whether R(phi) <= 0 somewhere, on 128 directions: the cell has parted into lobes."""
+    squares = np.sum(modes**2, axis=1)
+    near = np.flatnonzero(np.sqrt(squares).sum(axis=1) > np.sqrt(1.0 - 0.5 * squares.sum(axis=1)))
+    found = np.zeros(len(radius), bool)
+    if len(near):
+        rho, _ = contour_radii(modes[near], polarity[near], radius[near], 128)
+        found[near] = rho.min(axis=1) <= 0.0
+    return found
+
+
 def contours(
     position: Floats, modes: Floats, polarity: Floats, radius: Floats, points: int = 128
 ) -> Floats:

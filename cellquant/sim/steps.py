@@ -1,4 +1,7 @@
-"""From frame to frame: steps of one length, or steps that follow the error."""
+"""From frame to frame: steps of one length, or steps that follow the error.
+
+A step that fails is repeated in parts on the same Brownian path, within bounds.
+"""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +19,9 @@ Floats = NDArray[np.float64]
 ROOT_DEPTH = 2  # a root of the Brownian tree spans 2^2 steps
 WATCH_EVERY = 16  # steps between two checks of the step length
 CHATTER_LIMIT = 0.02  # RMS change of the displacement from one step to the next, L0
+REPAIRS = 6  # halvings of an equal step that failed
 DEEPEST = 14  # halvings of a frame interval that the adaptive method may make
+REMEDY = "take a smaller dt or the adaptive integrator"
 EASY = 0.15  # share of the tolerance below which it doubles the step
 
 
@@ -44,10 +49,14 @@ class Plan:
 class FixedSteps:
     """Equal steps of one method, watched for steps that are too long.
 
+    A step in which a cell jumps, or a shape ceases to be one, is repeated in two, four, ... parts.
+
     Attributes
     ----------
     count, rejected
         Steps taken and given up.
+    repaired
+        Steps that were taken in parts.
     elapsed
         Time since the start of the frame interval, t0.
     """
@@ -57,55 +66,85 @@ class FixedSteps:
         self.plan = plan
         self.count = 0
         self.rejected = 0
+        self.repaired = 0
         self.elapsed = 0.0
         self._method = find_method(integrator)[1].make(layer)
         self._tree = BrownianTree(layer.scene.seed, len(layer.radius), plan.h * 2**ROOT_DEPTH)
         self._still = np.zeros(len(layer.radius))
+        self._moved = np.zeros((len(layer.radius), 2))
         self._chatter = 0.0
 
     def save(self) -> Floats:
         """What a checkpoint has to keep."""
-        return np.array([self.count, self._chatter])
+        return np.array([self.count, self.rejected, self.repaired, self._chatter])
 
     def restore(self, stored: Floats) -> None:
         """Go on from what `save` returned."""
-        self.count, self._chatter = int(stored[0]), float(stored[1])
+        self.count, self.rejected, self.repaired = (int(x) for x in stored[:3])
+        self._chatter = float(stored[3])
 
     def advance(self, state: Floats, interval: int) -> None:
         """Advance a state over one frame interval, in place."""
         steps = self.plan.steps_per_frame
-        leaves = 2**ROOT_DEPTH
-        before = state[:, :2].copy()
-        moved: Floats | None = None
+        before = np.empty_like(state)
         for index in range(interval * steps, (interval + 1) * steps):
-            w = area = self._still
-            if self.layer.scene.has_noise:
-                ws, areas = self._tree.level(index // leaves, ROOT_DEPTH)
-                w, area = ws[index % leaves], areas[index % leaves]
-            watched = index % WATCH_EVERY < 2
-            if watched:
-                before[:] = state[:, :2]
-            self._method.step(state, self.plan.h, w, area)
+            before[:] = state
+            try:
+                self._take(state, index, 0)
+            except SimulationFailure as failure:
+                self._repair(state, before, index, failure)
             self.count += 1
             self.elapsed = (index + 1 - interval * steps) * self.plan.h
-            if watched:
-                previous, moved = moved, state[:, :2] - before
-                self._watch(moved, previous if index % WATCH_EVERY == 1 else None)
+            if index % WATCH_EVERY == 0:
+                self._moved = state[:, :2] - before[:, :2]
+            elif index % WATCH_EVERY == 1 and index > interval * steps:
+                self._watch(state[:, :2] - before[:, :2] - self._moved)
         self.elapsed = 0.0
 
-    def _watch(self, moved: Floats, previous: Floats | None) -> None:
-        """Stop where cells jump, or where the displacement changes too much from step to step."""
-        remedy = "take a smaller dt or the adaptive integrator"
-        reach = float(np.abs(moved).max())
-        if not reach < 0.5 * self.layer.scene.mean_radius:
-            cell = int(np.argmax(np.abs(moved).max(axis=1)))
-            raise SimulationFailure("a cell jumped within one step", remedy, cell=cell)
-        if previous is None:
-            return
-        change = float(np.sqrt(np.mean((moved - previous) ** 2)))
+    def _take(self, state: Floats, index: int, halvings: int) -> None:
+        """Take one step in 2^halvings parts."""
+        h, parts = self.plan.h / 2**halvings, 2**halvings
+        root, place = divmod(index, 2**ROOT_DEPTH)
+        limit = 0.5 * self.layer.scene.mean_radius
+        for part in range(place * parts, (place + 1) * parts):
+            w = area = self._still
+            if self.layer.scene.has_noise:
+                ws, areas = self._tree.level(root, ROOT_DEPTH + halvings)
+                w, area = ws[part], areas[part]
+            start = state[:, :2].copy()
+            self._method.step(state, h, w, area)
+            start -= state[:, :2]
+            if not max(start.max(), -start.min()) < limit:
+                cell = int(np.argmax(np.abs(start).max(axis=1)))
+                raise SimulationFailure("a cell jumped within one step", REMEDY, cell=cell)
+
+    def _repair(
+        self, state: Floats, before: Floats, index: int, failure: SimulationFailure
+    ) -> None:
+        """Take a step that failed in ever shorter parts."""
+        for halvings in range(1, REPAIRS + 1):
+            self.rejected += 1
+            state[:] = before
+            try:
+                self._take(state, index, halvings)
+            except SimulationFailure as again:
+                failure = again
+            else:
+                self.repaired += 1
+                return
+        state[:] = before
+        h = self.plan.h / 2**REPAIRS
+        raise SimulationFailure(
+            f"{failure.reason} even at a step of {h:.2g} t0", failure.remedy, cell=failure.cell
+        ) from failure
+
+    def _watch(self, difference: Floats) -> None:
+        """Stop where the displacement changes too much from step to step."""
+        change = float(np.sqrt(np.mean(difference**2)))
         self._chatter += 0.2 * (change / (2.0 * self.layer.scene.mean_radius) - self._chatter)
         if self._chatter > CHATTER_LIMIT:
-            raise SimulationFailure("the step is too long for the contacts, which chatter", remedy)
+            reason = "the step is too long for the contacts, which chatter"
+            raise SimulationFailure(reason, REMEDY)
 
 
 class AdaptiveSteps:
@@ -126,6 +165,7 @@ class AdaptiveSteps:
         self.layer = layer
         self.count = 0
         self.rejected = 0
+        self.repaired = 0
         self.elapsed = 0.0
         self._tolerance = tolerance
         self._span = plan.h * plan.steps_per_frame
