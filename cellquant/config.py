@@ -14,6 +14,7 @@ from cellquant.errors import InputError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[^/\\\x00-\x1f]+$")]
 
 
@@ -102,6 +103,12 @@ class SceneConfig(_Strict):
     mu_theta: NotNegative = 1.0
     mu_ab: NotNegative = 0.1
     modes: Annotated[int, Field(ge=1, le=24)] = 6
+    box: tuple[Positive, Positive] | None = None
+    aspect: Positive | None = None
+    radii: list[Positive] | None = None
+    initial: Literal["hexagonal", "random"] = "hexagonal"
+    positions: list[tuple[Finite, Finite]] | None = None
+    polarities: list[Finite] | None = None
     seed: Annotated[int, Field(ge=0)] = 1
     transient: NotNegative = 500.0
     duration: Positive = 1000.0
@@ -111,6 +118,24 @@ class SceneConfig(_Strict):
     integrator: str | None = None
     dt: Positive | None = None
     tolerance: Positive | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_count_the_cells(cls, content: Any) -> Any:
+        if isinstance(content, dict) and "cells" not in content:
+            for name in ("radii", "positions", "polarities"):
+                if isinstance(content.get(name), list):
+                    return {**content, "cells": len(content[name])}
+        return content
+
+    @model_validator(mode="after")
+    def _one_rule_each(self) -> "SceneConfig":
+        for kept, other in (
+            ("box", "phi"), ("box", "aspect"), ("radii", "polydispersity"), ("positions", "initial")
+        ):  # fmt: skip
+            if getattr(self, kept) is not None and other in self.model_fields_set:
+                raise ValueError(f"{kept} and {other} are both given; keep one")
+        return self
 
 
 class SweepConfig(_Strict):
@@ -269,6 +294,10 @@ rotational_diffusion = 0.01
 mu_theta = 1.0            # rotational mobility
 mu_ab = 0.1               # mobility of the shape modes
 modes = 6                 # highest Fourier mode of a contour; 1 for rigid discs
+# box = [30.0, 28.0]      # edges in L0 instead of phi; or aspect = Lx/Ly beside phi
+# radii = [0.5, 0.55]     # one per cell in L0, instead of polydispersity
+# initial = "random"      # then relaxed; without it a hexagonal lattice
+# positions = [[1.0, 1.0], [2.1, 1.0]]   # centres in L0, and polarities = [...] in radians
 transient = 500           # t0, not saved
 duration = 1000           # t0, saved after the transient
 seed = 1

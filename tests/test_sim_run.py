@@ -408,3 +408,29 @@ def test_a_shape_that_is_none_stops_with_the_partial_run():
         simulate(DRAWN_OUT, duration=30)
     assert caught.value.run.n_frames > 10
     assert np.isfinite(caught.value.run.modes).all()
+
+
+def test_scene_files_give_box_radii_and_initial_state():
+    from cellquant.config import SceneConfig, validate
+
+    def scene(**content):
+        return Scene.from_config(validate(content, SceneConfig, where="scene.toml"))
+
+    run = simulate(scene(box=[3.0, 2.0], radii=[0.5, 0.4, 0.6], initial="random"), duration=1)
+    assert run.box == (3.0, 2.0)
+    assert run.radius == pytest.approx([0.5, 0.4, 0.6])
+    assert run.phi == pytest.approx(np.pi * (0.25 + 0.16 + 0.36) / 6)
+    placed = scene(phi=0.8, positions=[[1, 1], [2, 1]], polarities=[0, 1.5])
+    assert placed.n_cells == 2
+    assert placed.positions == ((1.0, 1.0), (2.0, 1.0))
+    assert placed.polarities == (0.0, 1.5)
+    for wrong, match in (
+        ({"phi": 0.9, "box": [3, 2]}, "box and phi"),
+        ({"radii": [0.5, 0.5], "polydispersity": 0.1}, "radii and polydispersity"),
+        ({"radii": [0.5, 0.5], "cells": 3}, "radii must have one entry per cell"),
+        ({"positions": [[0, 0], [1, 1]], "initial": "random"}, "positions and initial"),
+        ({"box": [1.0, 1.0], "cells": 9}, "7.07 times its area"),
+        ({"radii": [0.5, -0.5]}, "radii"),
+    ):
+        with pytest.raises(InputError, match=match):
+            scene(**wrong)

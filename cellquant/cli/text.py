@@ -112,10 +112,13 @@ def run_lines(run: "Run") -> list[str]:
         if settings["tolerance"] is None
         else f"tolerance {settings['tolerance']:g} L0"
     )
+    contacts = "exact contacts"
+    if settings["contact"] != "exact":
+        contacts = f"contacts by {settings['points']} points"
     lines = [
-        f"scene: {scene.n_cells} cells, phi {scene.phi:g}, v0 {scene.v0:g}, eta {scene.eta:g}",
+        f"scene: {scene.n_cells} cells, phi {run.phi:.4g}, v0 {scene.v0:g}, eta {scene.eta:g}",
         f"box: {run.box[0]:.4f} x {run.box[1]:.4f} L0",
-        f"scheme: {settings['integrator']}, {pace}, {settings['contact']} contacts",
+        f"scheme: {settings['integrator']}, {pace}, {contacts}",
         f"saved: {run.n_frames} states, one every {settings['save_every']:g} t0, "
         f"after {settings['transient']:g} t0",
     ]

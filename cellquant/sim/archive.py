@@ -218,6 +218,11 @@ class Run:
         edges = np.asarray(self._group["box"][:], np.float64)
         return float(edges[0]), float(edges[1])
 
+    @property
+    def phi(self) -> float:
+        """Packing fraction sum(pi R0_i^2) / (Lx Ly)."""
+        return float(np.sum(math.pi * self.radius**2)) / (self.box[0] * self.box[1])
+
     def _frames(self, name: str) -> Floats:
         return np.asarray(self._group[name][: self.n_frames], np.float64)
 

@@ -237,6 +237,12 @@ class Scene:
             mu_theta=config.mu_theta,
             mu_ab=config.mu_ab,
             modes=config.modes,
+            box=config.box,
+            aspect=config.aspect,
+            radii=None if config.radii is None else tuple(config.radii),
+            initial=config.initial,
+            positions=None if config.positions is None else tuple(config.positions),
+            polarities=None if config.polarities is None else tuple(config.polarities),
             seed=config.seed,
         )
 
