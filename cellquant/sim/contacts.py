@@ -244,13 +244,11 @@ class Layer:
             return
         row = self._record[fault]
         reason = "the state is not finite"
+        remedy = "take a smaller step or the adaptive integrator"
         if np.isfinite(row[:2]).all() and np.isfinite(row[kernels.HEAD :]).all():
             reason = "the contour is no longer representable (a0^2 <= 0)"
-        raise SimulationFailure(
-            reason,
-            "take a smaller step or the adaptive integrator, a larger eta, or a smaller v0 or phi",
-            cell=fault,
-        )
+            remedy = "the cell is drawn out too far: take a larger eta, or a smaller v0 or phi"
+        raise SimulationFailure(reason, remedy, cell=fault)
 
     def _rebuild(self) -> None:
         position = np.ascontiguousarray(self._record[:, :2])

@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 ROOT_DEPTH = 2  # a root of the Brownian tree spans 2^2 steps
 WATCH_EVERY = 16  # steps between two checks of the step length
 CHATTER_LIMIT = 0.02  # RMS change of the displacement from one step to the next, L0
+LONGEST_MOVE = 0.1  # of a cell within one implicit step, in units of the mean radius
+JUMP = 0.5  # the same for explicit steps, which only an instability takes
 REPAIRS = 6  # halvings of an equal step that failed
 DEEPEST = 14  # halvings of a frame interval that the adaptive method may make
 REMEDY = "take a smaller dt or the adaptive integrator"
@@ -49,7 +51,9 @@ class Plan:
 class FixedSteps:
     """Equal steps of one method, watched for steps that are too long.
 
-    A step in which a cell jumps, or a shape ceases to be one, is repeated in two, four, ... parts.
+    An implicit step in which a cell moves too far, or a shape ceases to be one, is repeated in 2,
+    4, ... parts. Explicit steps that are too long stop the run: in parts they would only chatter
+    less visibly.
 
     Attributes
     ----------
@@ -69,6 +73,7 @@ class FixedSteps:
         self.repaired = 0
         self.elapsed = 0.0
         self._method = find_method(integrator)[1].make(layer)
+        self._explicit = integrator in ("euler", "sra1")
         self._tree = BrownianTree(layer.scene.seed, len(layer.radius), plan.h * 2**ROOT_DEPTH)
         self._still = np.zeros(len(layer.radius))
         self._moved = np.zeros((len(layer.radius), 2))
@@ -92,9 +97,13 @@ class FixedSteps:
             try:
                 self._take(state, index, 0)
             except SimulationFailure as failure:
+                if self._explicit:
+                    raise
                 self._repair(state, before, index, failure)
             self.count += 1
             self.elapsed = (index + 1 - interval * steps) * self.plan.h
+            if not self._explicit:
+                continue
             if index % WATCH_EVERY == 0:
                 self._moved = state[:, :2] - before[:, :2]
             elif index % WATCH_EVERY == 1 and index > interval * steps:
@@ -105,7 +114,7 @@ class FixedSteps:
         """Take one step in 2^halvings parts."""
         h, parts = self.plan.h / 2**halvings, 2**halvings
         root, place = divmod(index, 2**ROOT_DEPTH)
-        limit = 0.5 * self.layer.scene.mean_radius
+        limit = (JUMP if self._explicit else LONGEST_MOVE) * self.layer.scene.mean_radius
         for part in range(place * parts, (place + 1) * parts):
             w = area = self._still
             if self.layer.scene.has_noise:
@@ -116,7 +125,7 @@ class FixedSteps:
             start -= state[:, :2]
             if not max(start.max(), -start.min()) < limit:
                 cell = int(np.argmax(np.abs(start).max(axis=1)))
-                raise SimulationFailure("a cell jumped within one step", REMEDY, cell=cell)
+                raise SimulationFailure("a cell moves too far within one step", REMEDY, cell=cell)
 
     def _repair(
         self, state: Floats, before: Floats, index: int, failure: SimulationFailure
@@ -139,7 +148,7 @@ class FixedSteps:
         ) from failure
 
     def _watch(self, difference: Floats) -> None:
-        """Stop where the displacement changes too much from step to step."""
+        """Stop where explicit steps make the displacement change too much from step to step."""
         change = float(np.sqrt(np.mean(difference**2)))
         self._chatter += 0.2 * (change / (2.0 * self.layer.scene.mean_radius) - self._chatter)
         if self._chatter > CHATTER_LIMIT:
@@ -211,10 +220,10 @@ class AdaptiveSteps:
             state[:] = before
             self.rejected += 1
             if self._depth == self._deepest():
-                reason = "steps keep failing" if failure is None else failure.reason
+                reason = "the error exceeds the tolerance" if failure is None else failure.reason
                 raise SimulationFailure(
                     f"{reason} even at a step of {h:.2g} t0",
-                    "raise the tolerance, or make the scene less extreme (phi, v0, eta)",
+                    "raise the tolerance" if failure is None else failure.remedy,
                     cell=None if failure is None else failure.cell,
                 )
             self._depth += 1
