@@ -27,13 +27,45 @@ def voronoi(n_cells: int, size: int, seed: int) -> np.ndarray:
 
 
 def blobs(seed: int) -> np.ndarray:
-    """Touching cells with background between some of them, of one part each."""
+    """Touching cells with background between some of them, lines too, of one part each."""
     labels = voronoi(12, 50, seed)
     centres = np.random.default_rng(seed).random((4, 2)) * 50
     down, across = np.mgrid[:50, :50]
     for y, x in centres:
         labels[np.hypot(across - x, down - y) < 6] = 0
+    if seed % 2:
+        labels[cut_by_lines(labels)] = 0
+    for label in np.unique(labels)[1:]:
+        parts = connected(labels == label, connectivity=2)
+        sizes = np.bincount(parts.ravel())[1:]
+        largest = 1 + np.flatnonzero(sizes == sizes.max())
+        labels[(parts > 0) & ((parts != largest[0]) | (len(largest) > 1))] = 0
     return labels
+
+
+def cut_by_lines(labels: np.ndarray) -> np.ndarray:
+    """Pixels to the left of or above another label: lines of one pixel between all cells."""
+    line = np.zeros(labels.shape, bool)
+    line[:, :-1] |= labels[:, :-1] != labels[:, 1:]
+    line[:-1] |= labels[:-1] != labels[1:]
+    return line
+
+
+def hexagonal(radius: float, rng: np.random.Generator, *, line: float = 0.0) -> np.ndarray:
+    """A hexagonal tissue at a random turn and offset, with background lines between the cells."""
+    row, column = np.divmod(np.arange(400), 20)
+    lattice = np.stack([row * np.sqrt(3) / 2, column + 0.5 * (row % 2)], axis=-1)
+    spacing = radius * np.sqrt(2 * np.pi / np.sqrt(3))
+    size = int(12 * spacing)
+    turn = rng.random() * np.pi
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    seeds = spacing * (lattice - lattice.mean(axis=0)) @ rotation + size / 2 + rng.random(2)
+    pixels = np.stack(np.mgrid[:size, :size], axis=-1).reshape(-1, 2)
+    distance, nearest = cKDTree(seeds).query(pixels, k=2)
+    # Distance to the edge shared with the second nearest seed.
+    edge = (distance[:, 1] ** 2 - distance[:, 0] ** 2) / (2 * spacing)
+    labels = np.where(edge < line / 2, 0, nearest[:, 0] + 1)
+    return labels.reshape(size, size).astype(np.int32)
 
 
 def measures(cells: FrameCells) -> np.ndarray:
@@ -57,26 +89,22 @@ def test_area_has_no_bias() -> None:
     assert np.mean(area) / (np.pi * 12**2) == pytest.approx(1, abs=1e-3)
 
 
-def test_bias_in_a_confluent_tissue_does_not_depend_on_the_size_of_cells() -> None:
-    """A hexagonal tissue is exact within 0.3 % at every size; two rough estimates are not."""
+@pytest.mark.parametrize("line", [0.0, 1.0, 2.0])
+def test_bias_in_a_tissue_does_not_depend_on_the_size_of_cells(line: float) -> None:
+    """A hexagonal tissue is exact within 0.3 % at every size, with and without background lines.
+
+    Lines leave regular hexagons. A rough estimate of the length of a contour is not exact.
+    """
     exact = 6 / np.sqrt(1.5 * np.sqrt(3))
-    row, column = np.divmod(np.arange(400), 20)
-    lattice = np.stack([row * np.sqrt(3) / 2, column + 0.5 * (row % 2)], axis=-1)
-    lattice -= lattice.mean(axis=0)
     rng = np.random.default_rng(2)
     bias, rough = [], []
     for radius in (8, 9, 12, 16, 20):
-        spacing = radius * np.sqrt(2 * np.pi / np.sqrt(3))
-        size = int(12 * spacing)
-        pixels = np.stack(np.mgrid[:size, :size], axis=-1).reshape(-1, 2)
         p, q = [], []
         for _ in range(3):
-            turn = rng.random() * np.pi
-            rotation = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-            seeds = spacing * lattice @ np.array(rotation) + size / 2 + rng.random(2)
-            labels = cKDTree(seeds).query(pixels)[1].reshape(size, size).astype(np.int32) + 1
+            labels = hexagonal(radius, rng, line=line)
             cells = measure_frame(labels)
             outlines, inner = cells.outlines, ~cells.outlines.touches_border
+            inner &= outlines.area > 0.5 * np.median(outlines.area)
             p.append((outlines.perimeter / np.sqrt(outlines.area))[inner])
             table = regionprops_table(labels, properties=("label", "perimeter", "area"))
             inner = np.isin(table["label"], cells.label[inner])
@@ -181,13 +209,7 @@ def test_invariance(seed: int, turns: int, down: int) -> None:
     np.testing.assert_allclose(moved.outlines.y - down, before.outlines.y, atol=1e-9)
 
     turned = measures(measure_frame(np.ascontiguousarray(np.rot90(labels, turns))))
-    known = measures(before)
-    same = np.isclose(turned, known, rtol=1e-9, equal_nan=True).all(axis=1)
-    # Around a tangle of tiny cells the order of the scan may decide who is a neighbour, by one
-    # cell, and with it where a contour is cut; that stays rare and small.
-    assert (~same).sum() <= max(1, 0.25 * len(same))
-    np.testing.assert_allclose(turned[:, :2], known[:, :2], rtol=0.05)
-    assert np.abs(turned[:, 3] - known[:, 3]).max() <= 1
+    np.testing.assert_allclose(turned, measures(before), rtol=1e-9)
 
 
 @settings(max_examples=60, deadline=None)

@@ -21,6 +21,12 @@ def stack(*frames: np.ndarray, pixel_size: float = 0.5) -> LabelStack:
     return LabelStack.from_array(np.stack(frames), pixel_size=pixel_size, frame_interval=10)
 
 
+def spread(body: np.ndarray) -> int:
+    """n^2 times the spread of the pixels about their centroid, in integers."""
+    y, x = np.nonzero(body)
+    return int(len(x) * (x @ x + y @ y) - x.sum() ** 2 - y.sum() ** 2)
+
+
 def square(row: int = 5, column: int = 5, label: int = 1, *, side: int = 10) -> np.ndarray:
     labels = np.zeros((40, 50), np.int64)
     labels[row : row + side, column : column + side] = label
@@ -82,6 +88,17 @@ def test_fragments_and_specks_are_left_out() -> None:
     assert (cells.faults["fragments"], cells.faults["specks"]) == (2, 2)
     assert np.isnan(cells.table["shape_index"]).tolist() == [False, True]
     assert cells.faults["too_small_for_contour"] == 1
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_of_equal_parts_the_most_compact_is_the_cell(turns: int) -> None:
+    """Whatever comes first in reading order: turning the image changes nothing."""
+    labels = np.zeros((40, 50), np.int64)
+    labels[5:8, 5:17] = 1  # 3 x 12
+    labels[20:26, 30:36] = 1  # 6 x 6
+    outlines = measure_frame(np.rot90(labels, turns)).outlines
+    assert outlines.area.tolist() == [36]
+    assert outlines.aspect_ratio[0] == pytest.approx(1)
 
 
 def test_parts_that_touch_by_a_corner_are_one_cell() -> None:
@@ -176,14 +193,16 @@ def test_frame_numbers_of_the_stack_are_kept() -> None:
     )
 )
 def test_rules_by_brute_force(labels: np.ndarray) -> None:
-    """Largest part, filled holes and the edge of the image by scipy, label by label."""
+    """Body of each label, filled holes and the edge of the image by scipy, label by label."""
     areas, borders, holes = {}, {}, 0
     for label in np.unique(labels[labels > 0]):
         parts, _ = ndi.label(labels == label, structure=EIGHT)
         sizes = np.bincount(parts.ravel())[1:]
         if sizes.max() == 1:
             continue
-        body = parts == 1 + np.argmax(sizes)
+        # Least spread about the centroid among equals, then the first in reading order.
+        largest = 1 + np.flatnonzero(sizes == sizes.max())
+        body = min((parts == k for k in largest), key=spread)
         filled = ndi.binary_fill_holes(body)
         holes += ndi.label(filled & ~body)[1]
         areas[int(label)] = int(filled.sum())

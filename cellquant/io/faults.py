@@ -1,7 +1,8 @@
 """What is wrong with a frame of label masks, counted in one pass over its pixels.
 
 A part is a set of pixels of one label that touch by an edge or a corner. The largest part of a
-label (the first in reading order among equals) is its body.
+label is its body; among equals the most compact one, and of congruent ones the first in reading
+order.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ Ints = np.ndarray[Any, np.dtype[np.int64]]
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 # Columns of the table of parts; row and column are those of the first pixel in reading order.
-_LABEL, _PIXELS, _SUM_X, _SUM_Y, _EULER, _BORDER, _ROW, _COLUMN = range(8)
+_LABEL, _PIXELS, _SUM_X, _SUM_Y, _SUM_SQUARES, _EULER, _BORDER, _ROW, _COLUMN = range(9)
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,11 @@ def find_faults(labels: np.ndarray[Any, Any]) -> FrameFaults:
     Gray, IEEE Transactions on Computers C-20, 551 (1971), for the Euler number by local counts.
     """
     parts = _scan(np.ascontiguousarray(labels))
-    order = np.lexsort((-parts[:, _PIXELS], parts[:, _LABEL]))  # stable: reading order last
+    # The spread about the centroid, times the square of the number of pixels, in exact integers:
+    # it does not change when the image is turned. Stable: reading order last.
+    spread = parts[:, _PIXELS] * parts[:, _SUM_SQUARES]
+    spread -= parts[:, _SUM_X] ** 2 + parts[:, _SUM_Y] ** 2
+    order = np.lexsort((spread, -parts[:, _PIXELS], parts[:, _LABEL]))
     parts = parts[order]
     starts = np.flatnonzero(np.diff(parts[:, _LABEL], prepend=0))
     body = np.zeros(len(parts), dtype=bool)
@@ -157,14 +162,14 @@ def _root(parent, part):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def _scan(labels):  # type: ignore[no-untyped-def]
-    """Table of the parts of all labels in reading order: label, pixels, sums, Euler, border, start.
+    """Table of the parts of all labels in reading order, columns as named above.
 
     Rows are cut into runs; each run joins the parts of the runs above that it touches.
     """
     height, width = labels.shape
     size = 1024
     parent = np.empty(size, np.int64)
-    table = np.zeros((size, 8), np.int64)
+    table = np.zeros((size, 9), np.int64)
     n_parts = 0
     # Runs of the row above and of this one: first column, column after the last, part.
     above = np.empty((width, 3), np.int64)
@@ -205,22 +210,26 @@ def _scan(labels):  # type: ignore[no-untyped-def]
                     longer = np.empty(size, np.int64)
                     longer[:n_parts] = parent
                     parent = longer
-                    taller = np.zeros((size, 8), np.int64)
+                    taller = np.zeros((size, 9), np.int64)
                     taller[:n_parts] = table
                     table = taller
                 part = n_parts
                 parent[part] = part
                 table[part, 0] = label
-                table[part, 6] = row
-                table[part, 7] = start
+                table[part, 7] = row
+                table[part, 8] = start
                 n_parts += 1
             length = stop - start
             table[part, 1] += length
             table[part, 2] += (start + stop - 1) * length // 2
             table[part, 3] += row * length
-            table[part, 4] += 1 - contacts
+            table[part, 4] += row * row * length
+            # Sum of the squares from start to stop - 1.
+            table[part, 4] += (stop - 1) * stop * (2 * stop - 1) // 6
+            table[part, 4] -= (start - 1) * start * (2 * start - 1) // 6
+            table[part, 5] += 1 - contacts
             if row == 0 or row == height - 1 or start == 0 or stop == width:
-                table[part, 5] = 1
+                table[part, 6] = 1
             here[n_here, 0] = start
             here[n_here, 1] = stop
             here[n_here, 2] = part
@@ -234,12 +243,12 @@ def _scan(labels):  # type: ignore[no-untyped-def]
         root = _root(parent, part)
         if root == part:
             place[part] = n_roots
-            for column in range(8):
+            for column in range(9):
                 table[n_roots, column] = table[part, column]
             n_roots += 1
         else:
             target = place[root]
-            for column in range(1, 5):
+            for column in range(1, 6):
                 table[target, column] += table[part, column]
-            table[target, 5] |= table[part, 5]
+            table[target, 6] |= table[part, 6]
     return table[:n_roots].copy()

@@ -5,7 +5,8 @@ the right-hand side; everything is measured on that one closed path. Its length 
 through overlapping digital straight segments, which are long where the contour is straight and
 short where it bends, so that nothing has to be known of the size of the cells. Where the label
 beside the cell changes, the contour may have a corner: segments end there, and the length that
-pixels miss at the tip is added.
+pixels miss at the tip is added. Of a cell that background lines cut out, the cells across the
+lines are what it has beside it.
 
 References
 ----------
@@ -35,10 +36,24 @@ _MIN_ARC = 3
 _MAX_SEGMENT = 100
 # Largest turn at a junction, rad: a sharper tip has no finite mean loss.
 _MAX_TURN = 2.6
-# Length that straight segments fitted up to a corner add to it (px), and the turn from which on
-# they do so in full (rad). Measured on Voronoi tissue at radii of 8 to 20 px.
+# Length that straight segments fitted up to a corner add to it (px), at contacts and between two
+# lines, where the place of the corner is less certain; and the turn from which on they do so in
+# full (rad). Measured on Voronoi tissue at radii of 8 to 20 px.
 _CORNER_GAIN = 0.05
+_LINE_GAIN = 0.025
 _FULL_TURN = np.pi / 3
+
+# Share of the contour along lines from which on a cell counts as cut out by them.
+_LINED = 0.5
+# Pixels around a background pixel, nearest first, in which the cell across a line is looked for.
+_AROUND = np.array(
+    sorted(
+        (x * x + y * y, x, y)
+        for x in range(-NEIGHBOUR_GAP, NEIGHBOUR_GAP + 1)
+        for y in range(-NEIGHBOUR_GAP, NEIGHBOUR_GAP + 1)
+        if 0 < x * x + y * y <= NEIGHBOUR_GAP**2
+    )
+)
 
 # Steps along a crack: right, down, left, up.
 _DX = np.array([1, 0, -1, 0])
@@ -175,6 +190,97 @@ def _junctions(outside, n, junctions):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
+def _nearest(labels, row, column, label, touching, n_touching):  # type: ignore[no-untyped-def]
+    """Label nearest to a background pixel other than that of the cell; 0 where there is none.
+
+    None, too, is what two labels at one distance are, and a cell that touches this one.
+    """
+    height, width = labels.shape
+    nearest, reach = 0, 0
+    for k in range(len(_AROUND)):
+        if nearest != 0 and _AROUND[k, 0] > reach:
+            break
+        x, y = column + _AROUND[k, 1], row + _AROUND[k, 2]
+        if not (0 <= x < width and 0 <= y < height):
+            continue
+        other = np.int64(labels[y, x])
+        if other == 0 or other == label or other == nearest:  # noqa: SIM109
+            continue
+        if nearest != 0:
+            return 0
+        nearest, reach = other, _AROUND[k, 0]
+    for k in range(n_touching):
+        if touching[k] == nearest:
+            return 0
+    return nearest
+
+
+@nb.njit(cache=True)
+def _across_lines(  # type: ignore[no-untyped-def]
+    labels, row, column, steps, outside, n, touching, n_touching, across
+):
+    """Cells across lines of background, crack by crack; 0 for none, -1 at a contact.
+
+    Returns how many cracks have one.
+    """
+    label = np.int64(labels[row, column])
+    x, y = column, row
+    n_across = 0
+    for i in range(n):
+        step = steps[i]
+        across[i] = -1
+        if outside[i] == 0:
+            column_out = x - (1 if step == 2 or step == 3 else 0)
+            row_out = y - (1 if step == 0 or step == 3 else 0)
+            across[i] = _nearest(labels, row_out, column_out, label, touching, n_touching)
+            n_across += across[i] > 0
+        x += _DX[step]
+        y += _DY[step]
+    return n_across
+
+
+@nb.njit(cache=True)
+def _line_junctions(across, n, junctions, n_junctions):  # type: ignore[no-untyped-def]
+    """Add the cracks at which the contour passes from one cell across a line to the next.
+
+    As in `_junctions` stretches shorter than `_MIN_ARC` do not count. Where open background or a
+    contact lies between two cells, no corner is theirs.
+    """
+    first = -1
+    for i in range(n):
+        if across[i] != across[i - 1 if i > 0 else n - 1]:
+            first = i
+            break
+    if first < 0:
+        return n_junctions
+    n_before = n_junctions
+    stop, label = -1, 0
+    opening, opening_label = -1, 0
+    i = first
+    while i < first + n:
+        start = i
+        beside = across[i % n]
+        while i < first + n and across[i % n] == beside:
+            i += 1
+        if i - start < _MIN_ARC:
+            continue
+        if stop < 0:
+            opening, opening_label = start, beside
+        elif beside > 0 and label > 0 and beside != label:
+            junctions[n_junctions] = (stop + start) // 2 % n
+            n_junctions += 1
+        stop, label = i, beside
+    if label > 0 and opening_label > 0 and label != opening_label:
+        junctions[n_junctions] = (stop + opening + n) // 2 % n
+        n_junctions += 1
+    if n_junctions > n_before:
+        for k in range(n_before):
+            junctions[k] %= n
+        junctions[:n_junctions].sort()
+    return n_junctions
+
+
+@nb.njit(cache=True)
 def _straight(steps, n, start, limit):  # type: ignore[no-untyped-def]
     """Longest digital straight segment from one crack on.
 
@@ -296,8 +402,8 @@ def _arc_length(steps, n, start, count, closed, points, ends):  # type: ignore[n
 
 
 @nb.njit(cache=True)
-def _lost_at_corner(turn):  # type: ignore[no-untyped-def]
-    """Mean length (px) missed at a corner, less what fitting up to the corner adds.
+def _lost_at_corner(turn, gain):  # type: ignore[no-untyped-def]
+    """Mean length (px) missed at a corner, less the gain of fitting up to the corner.
 
     A row of pixels sees a tip only where its chord is at least one pixel long. For edges at
     angles alpha and beta to the row, alpha + beta = turn, the height missed is
@@ -310,30 +416,34 @@ def _lost_at_corner(turn):  # type: ignore[no-untyped-def]
     mean = np.sin(1.5 * turn) / (3.0 * turn)
     mean += (1.0 - 2.0 * np.cos(turn)) * np.sin(0.5 * turn) / turn
     missed = np.sin(0.5 * turn) * mean * turn / (np.pi * np.sin(turn))
-    return missed - _CORNER_GAIN * min(1.0, (turn / _FULL_TURN) ** 2)
+    return missed - gain * min(1.0, (turn / _FULL_TURN) ** 2)
 
 
 @nb.njit(cache=True)
-def _length(steps, outside, n, junctions, points):  # type: ignore[no-untyped-def]
+def _length(steps, outside, n, junctions, n_junctions, points):  # type: ignore[no-untyped-def]
     """Length of a whole contour: its arcs between junctions, and what is lost at these."""
     ends = np.empty(4)
-    n_junctions = _junctions(outside, n, junctions)
     if n_junctions < 2:
         return _arc_length(steps, n, 0, n, True, points, ends)
     total = 0.0
     opening_x, opening_y, last_x, last_y = 0.0, 0.0, 0.0, 0.0
-    for k in range(n_junctions):
-        start = junctions[k]
-        stop = junctions[k + 1] if k + 1 < n_junctions else junctions[0] + n
-        total += _arc_length(steps, n, start, stop - start, False, points, ends)
-        if k == 0:
-            opening_x, opening_y = ends[0], ends[1]
+    for k in range(n_junctions + 1):
+        start = junctions[k % n_junctions]
+        if k < n_junctions:
+            stop = junctions[k + 1] if k + 1 < n_junctions else junctions[0] + n
+            total += _arc_length(steps, n, start, stop - start, False, points, ends)
+            next_x, next_y = ends[0], ends[1]
         else:
-            cross, dot = last_x * ends[1] - last_y * ends[0], last_x * ends[0] + last_y * ends[1]
-            total += _lost_at_corner(np.arctan2(cross, dot))
+            next_x, next_y = opening_x, opening_y
+        if k == 0:
+            opening_x, opening_y = next_x, next_y
+        else:
+            # Amid background the corner is between two lines, and its place less certain.
+            amid = outside[start % n] == 0 and outside[(start - 1) % n] == 0
+            cross, dot = last_x * next_y - last_y * next_x, last_x * next_x + last_y * next_y
+            total += _lost_at_corner(np.arctan2(cross, dot), _LINE_GAIN if amid else _CORNER_GAIN)
         last_x, last_y = ends[2], ends[3]
-    cross = last_x * opening_y - last_y * opening_x
-    return total + _lost_at_corner(np.arctan2(cross, last_x * opening_x + last_y * opening_y))
+    return total
 
 
 @nb.njit(cache=True)
@@ -346,7 +456,9 @@ def _measure(labels, rows, columns, gap):  # type: ignore[no-untyped-def]
     steps = np.empty(1024, np.int8)
     outside = np.empty(1024, np.int64)
     seen = np.empty(64, np.int64)
+    touching = np.empty(64, np.int64)
     junctions = np.empty(1024, np.int64)
+    across = np.empty(1024, np.int64)
     points = np.empty((1024, 7))
     for cell in range(n_cells):
         row, column = rows[cell], columns[cell]
@@ -357,7 +469,7 @@ def _measure(labels, rows, columns, gap):  # type: ignore[no-untyped-def]
         s, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
         x, y = 0, 0
         low_x, high_x, high_y = 0, 0, 0
-        n_seen = 0
+        n_seen, n_touching = 0, 0
         surrounding = outside[0]
         for i in range(n):
             step = steps[i]
@@ -387,9 +499,22 @@ def _measure(labels, rows, columns, gap):  # type: ignore[no-untyped-def]
                     look_y += _DY[normal]
                     if not (0 <= look_x < width and 0 <= look_y < height):
                         break
-                    beyond = labels[look_y, look_x]
+                    beyond = np.int64(labels[look_y, look_x])
                     if beyond != 0:
                         break
+            if outside[i] > 0:
+                known = False
+                for j in range(n_touching - 1, -1, -1):
+                    if touching[j] == beyond:
+                        known = True
+                        break
+                if not known:
+                    if n_touching == len(touching):
+                        longer = np.empty(2 * n_touching, np.int64)
+                        longer[:n_touching] = touching
+                        touching = longer
+                    touching[n_touching] = beyond
+                    n_touching += 1
             if beyond > 0 and beyond != label:
                 known = False
                 for j in range(n_seen - 1, -1, -1):
@@ -425,7 +550,15 @@ def _measure(labels, rows, columns, gap):  # type: ignore[no-untyped-def]
             if n > len(points):
                 points = np.empty((2 * n, 7))
                 junctions = np.empty(2 * n, np.int64)
-            values[cell, 3] = _length(steps, outside, n, junctions, points)
+                across = np.empty(2 * n, np.int64)
+            n_junctions = _junctions(outside, n, junctions)
+            if n_seen > n_touching + 1:  # two cells at least lie across lines
+                n_across = _across_lines(
+                    labels, row, column, steps, outside, n, touching, n_touching, across
+                )
+                if n_across >= _LINED * n:
+                    n_junctions = _line_junctions(across, n, junctions, n_junctions)
+            values[cell, 3] = _length(steps, outside, n, junctions, n_junctions, points)
         values[cell, 4] = np.sqrt((middle + spread) / (middle - spread))
         values[cell, 5] = angle if angle > -0.5 * np.pi else 0.5 * np.pi
     return values, flags, n_neighbours

@@ -3,8 +3,9 @@
 The masks themselves are never altered. The rules, each counted under the name in brackets:
 
 - Pixels of one label that touch by an edge or a corner form a part. The largest part of a label
-  (the first in reading order among equals) is the cell. Every other part is left out
-  [``fragments``], or [``specks``] when it is a single pixel.
+  is the cell: among equals the most compact one (least spread about its centroid), of congruent
+  ones the first in reading order. Every other part is left out [``fragments``], or [``specks``]
+  when it is a single pixel.
 - A label of one single pixel is no cell and is left out [``specks``].
 - What a cell encloses belongs to it: holes are filled [``holes``].
 - A label with another one all around it is measured as well [``enclosed_cells``], and the area of
