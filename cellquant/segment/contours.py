@@ -196,7 +196,7 @@ def _nearest(labels, row, column, label, touching, n_touching):  # type: ignore[
     None, too, is what two labels at one distance are, and a cell that touches this one.
     """
     height, width = labels.shape
-    nearest, reach = 0, 0
+    nearest, reach = np.int64(0), 0
     for k in range(len(_AROUND)):
         if nearest != 0 and _AROUND[k, 0] > reach:
             break
