@@ -105,3 +105,30 @@ def test_fine_quadrature_converges_to_the_exact_rule_for_pinched_cells():
     fine = Layer(layer.scene, radius, box, contact="quadrature", points=10_000)
     difference = velocity(layer, state) - velocity(fine, state)
     assert np.abs(difference).max() < 1e-3
+
+
+@pytest.mark.parametrize(("waist", "limit"), [(0.6, 1e-9), (0.1, 1e-5), (-0.05, 2e-4)])
+def test_shape_index_against_adaptive_quadrature(waist, limit):
+    from scipy.integrate import quad
+
+    from cellquant.sim.shapes import contours, measure_shapes, pinched
+
+    _, state, radius, _ = layer_with_pinches(5, waist=waist)
+    modes = state[:, 3:].reshape(len(state), 2, -1)
+    found = measure_shapes(modes, state[:, 2], radius)["shape_index"]
+    n = np.arange(2, MODES + 1)
+    for cell in range(len(state)):
+        a, b = modes[cell]
+        a0 = math.sqrt(1 - 0.5 * (a @ a + b @ b))
+
+        def stretch(phi, a=a, b=b, a0=a0):
+            c, s = np.cos(n * phi), np.sin(n * phi)
+            return math.hypot(a0 + a @ c + b @ s, n @ (b * c - a * s))
+
+        length, _ = quad(stretch, 0, 2 * np.pi, limit=2000, epsabs=1e-11)
+        assert found[cell] == pytest.approx(length / math.sqrt(math.pi), rel=limit)
+    closed = pinched(modes, state[:, 2], radius)
+    assert closed.tolist() == [waist < 0 and cell in (0, 4) for cell in range(9)]
+    outline = contours(state[:, :2], modes, state[:, 2], radius)
+    reach = np.linalg.norm(outline - state[:, None, :2], axis=2).min(axis=1)
+    assert ((reach == 0.0) == closed).all()

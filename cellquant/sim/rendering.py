@@ -172,7 +172,7 @@ def render(
         )
     pixel = pixel_size / length
     width, height = int(run.box[0] / pixel), int(run.box[1] / pixel)
-    if 2.0 * float(np.median(run.radius)) < 6.0 * pixel:
+    if 2.0 * float(np.median(run.radius)) < 4.0 * pixel:
         raise InputError(
             f"a pixel of {pixel_size:g} um is too coarse for cells of "
             f"{2 * np.median(run.radius) * length:.3g} um; take a smaller pixel_size."
@@ -273,7 +273,9 @@ class _Painter:
         edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
         shapes["touches_border"] = np.isin(shapes["label"], edge)
         shapes["n_neighbours"] = _count_touching(labels, len(cells))
-        outline = contours(place, modes[cells], state[cells, 2], self.run.radius[cells], 64)
+        outline = contours(
+            place, modes[cells], state[cells, 2], self.run.radius[cells], CONTOUR_POINTS
+        )
         return labels, shapes, outline.astype(np.float32)
 
     def _parts(self, state: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
