@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cellquant.errors import InputError
-from cellquant.sim import kernels, pinches, stiffness
+from cellquant.sim import kernels, pinches
 from cellquant.sim.scene import Scene, SimulationFailure
 
 Floats = NDArray[np.float64]
@@ -173,28 +173,12 @@ class Layer:
         near: NDArray[np.bool_] = np.hypot(*apart.T) < self.radius[pairs].sum(axis=1)
         return pairs[near]
 
-    def gather_stiffness(
-        self, state: Floats, scale: Floats, weight: Any, factor: Any, turning: Any, cells: Any
-    ) -> int:
-        """Collect the stiff directions of the last state evaluated; see `stiffness.gather`."""
-        return int(
-            stiffness.gather(
-                state,
-                self.radius,
-                self._record,
-                self._first,
-                self._other,
-                self._root_first,
-                self._root_last,
-                self._roots,
-                scale,
-                self.scene.k,
-                weight,
-                factor,
-                turning,
-                cells,
-            )
-        )
+    @property
+    def crossings(self) -> tuple[Any, ...]:
+        """Contours, pairs and crossings of the state evaluated last, by the exact rule."""
+        return (
+            self._record, self._first, self._other, self._root_first, self._root_last, self._roots,
+        )  # fmt: skip
 
     def age_of_list(self) -> Floats:
         """Centres, reach and lowest radius (N, 4) for which the neighbour list was made."""

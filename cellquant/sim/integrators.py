@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cellquant.errors import InputError
-from cellquant.sim import stiffness
 from cellquant.sim.contacts import Layer
 from cellquant.sim.scene import Scene
-from cellquant.sim.stiffness import square_roots_of_mobilities
+from cellquant.sim.stiffness import StiffPart
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +26,9 @@ class Integrator(Protocol):
     def step(self, state: Floats, h: float, w: Floats, area: Floats) -> None:
         """Advance `state` by h, with increments w (N,) and areas (N,) of the Brownian paths."""
 
+    def restart(self) -> None:
+        """Forget earlier steps, so that a resumed run goes on as one that never stopped."""
+
 
 class Euler:
     """Euler-Maruyama, the published scheme: strong order 1, for h below 2 / stiffness."""
@@ -35,6 +37,9 @@ class Euler:
         self._layer = layer
         self._noise = math.sqrt(2.0 * layer.scene.D_r)
         self._slope = np.empty((len(layer.radius), layer.n_columns))
+
+    def restart(self) -> None:
+        """Nothing is remembered from step to step."""
 
     def step(self, state: Floats, h: float, w: Floats, area: Floats) -> None:
         """Advance by one evaluation."""
@@ -58,6 +63,9 @@ class Sra1:
         shape = (len(layer.radius), layer.n_columns)
         self._first, self._second, self._stage = np.empty(shape), np.empty(shape), np.empty(shape)
 
+    def restart(self) -> None:
+        """Nothing is remembered from step to step."""
+
     def step(self, state: Floats, h: float, w: Floats, area: Floats) -> None:
         """Advance by two evaluations; the second one sees the time-averaged path."""
         self._layer.velocity(state, self._first)
@@ -73,97 +81,148 @@ class Sra1:
 
 
 class Implicit:
-    r"""Linearly implicit steps with one correction: stable for stiff contacts at any step.
+    r"""Linearly implicit steps with one evaluation, on the mean of the Brownian path.
 
-    With A = M H, M the mobilities and H the stiff part of the Hessian (see `stiffness`), f the
-    drift and nu the noise of the step:
+    With f the drift, A the stiff part of its Jacobian (see `stiffness`) and nu the noise of the
+    polarities, whose mean over the step is nu-bar = (W / 2 + H) sqrt(2 D_r):
 
     .. math::
-        (1 + h A) d_1 = h f(x) + \nu, \qquad
-        (1 + h A) (d - d_1) = \tfrac{h}{2} [f(x + d_1) - (d_1 - \nu) / h]
+        \hat x = x + \bar\nu, \qquad (1 + c h A) d = h f(\hat x), \qquad x' = x + d + \nu
 
-    The contacts answer to the noise within the step, since nu stands on the right-hand side. The
-    bracket is what the linearisation left out. Two evaluations; d - d_1 estimates the error.
+    c is 1/2 where a step is short for the contacts, which makes it the implicit midpoint rule, and
+    grows with h times their mean stiffness: the push of a contact goes as the square root of its
+    depth, so the secant over a step in which it opens is twice the tangent, and contacts that form
+    within the step are not in A at all. Where A would change nothing it is left out.
     """
 
     def __init__(self, layer: Layer) -> None:
-        scene = layer.scene
-        if layer.contact != "exact" or scene.rigid:
-            raise InputError(
-                "the implicit integrator needs deformable cells and the exact contact rule; "
-                "choose integrator euler."
-            )
+        _need_exact_contacts(layer)
         self._layer = layer
-        self._noise = math.sqrt(2.0 * scene.D_r)
-        self._scale = square_roots_of_mobilities(
-            scene.mu_r, scene.mu_theta, scene.mu_ab, scene.modes
-        )
-        inverse = np.zeros_like(self._scale)
-        np.divide(1.0, self._scale, out=inverse, where=self._scale > 0.0)
-        self._inverse = inverse
+        self._noise = math.sqrt(2.0 * layer.scene.D_r)
+        self._stiff = StiffPart(layer)
         shape = (len(layer.radius), layer.n_columns)
-        self._modes = (0,) * (scene.modes - 1)
-        self._padded = 8 * ((layer.n_columns + 7) // 8)
-        n = np.arange(2, scene.modes + 1)
-        stretch = np.concatenate([np.zeros(3), np.tile(n**2 - 1.0, 2)])
-        self._diagonal = np.zeros((shape[0], self._padded))
-        self._diagonal[:, : shape[1]] = (
-            scene.eta * math.pi * layer.radius[:, None] * stretch * self._scale**2
-        )
-        self._drift, self._stage = np.empty(shape), np.empty(shape)
-        self._right, self._first, self._second, *self._work = (
-            np.zeros((shape[0], self._padded)) for _ in range(6)
-        )
-        self._allocate(8 * shape[0])
-        self.error = 0.0
+        self._middle, self._drift, self._moved = (np.empty(shape) for _ in range(3))
+        self._h = 0.0
+        self._diagonal = np.zeros_like(self._stiff.tension, dtype=np.float32)
+        self._since = 0
 
-    def _allocate(self, room: int) -> None:
-        self._weight = np.zeros((room, 2 * self._padded))
-        self._factor = np.empty(room)
-        self._turning = np.empty((room, 2))
-        self._cells = np.empty((room, 2), np.int64)
-
-    def _solve(self, h: float, out: Floats) -> None:
-        stiffness.solve(
-            self._count, self._weight, self._factor, self._cells, self._diagonal, h, self._modes,
-            self._right, CG_TOLERANCE, CG_MOST, out, *self._work,
-        )  # fmt: skip
+    def restart(self) -> None:
+        """Forget how stiff the contacts were: what follows depends on the state alone."""
+        self._since = 0
 
     def step(self, state: Floats, h: float, w: Floats, area: Floats) -> None:
-        """Advance by two evaluations and two linear solves."""
-        width = state.shape[1]
-        drift, stage, right = self._drift, self._stage, self._right[:, :width]
-        first, second = self._first[:, :width], self._second[:, :width]
-        self._layer.velocity(state, drift)
-        while True:
-            self._count = self._layer.gather_stiffness(
-                state, self._scale, self._weight, self._factor, self._turning, self._cells
+        """Advance by one evaluation and at most one linear solve."""
+        stiff, middle, drift = self._stiff, self._middle, self._drift
+        if h != self._h:
+            # Exact for shape modes that relax alone: 1 / (1 + c z) = (1 - exp(-z)) / z.
+            z = h * stiff.tension
+            self._diagonal[:] = np.where(
+                z > 1e-6, z / np.maximum(-np.expm1(-z), 1e-300) - 1.0, 0.5 * z
             )
-            if self._count <= len(self._factor):
-                break
-            self._allocate(self._count + self._count // 4)
-        turned = self._noise * w
-        np.multiply(drift, h * self._inverse, out=right)
+            self._h = h
+        np.copyto(middle, state)
         if self._noise > 0.0:
-            stiffness.add_turning(
-                self._count, self._weight, self._factor, self._turning, self._cells, turned, h,
-                self._right,
-            )  # fmt: skip
-        self._solve(h, self._first)
-        np.multiply(first, self._scale, out=stage)
-        stage += state
-        stage[:, 2] += turned
+            middle[:, 2] += self._noise * (0.5 * w + area)
+        self._layer.velocity(middle, drift)
+        drift *= h
+        if self._since % LOOK_EVERY == 0 or h * stiff.mean > SLACK:
+            stiff.collect()
+        self._since += 1
+        if h * stiff.mean > SLACK or self._diagonal.max(initial=0.0) > SLACK:
+            stiff.solve(middle, drift, h * _share(h * stiff.mean), self._diagonal, self._moved)
+            state += self._moved
+        else:
+            state += drift
+        if self._noise > 0.0:
+            state[:, 2] += self._noise * w
+
+
+class Rosenbrock:
+    r"""Stochastic Rosenbrock-W steps of two evaluations: strong order 1.5, and an error estimate.
+
+    With A and c as for `Implicit` (order 2 without noise holds for any A):
+
+    .. math::
+        (1 + c h A) k_1 = h f(x + \nu_1), \qquad
+        (1 + c h A) k_2 = h f(x + k_1 + \nu_2) - 2 k_1, \qquad
+        x' = x + \tfrac{3}{2} k_1 + \tfrac{1}{2} k_2 + \nu
+
+    nu_1 and nu_2 are the noise at (1/2 -+ 1/sqrt 6) W + H: their mean is that of the path, and
+    their mean square agrees with it in expectation. (k_1 + k_2) / 2, the difference to the step of
+    order 1, estimates the error.
+
+    Attributes
+    ----------
+    error
+        RMS length of the estimated error of the centres in the last step, L0.
+
+    References
+    ----------
+    Verwer, Spee, Blom & Hundsdorfer, SIAM J. Sci. Comput. 20 (1999) 1456 (ROS2, as a W-method);
+    Roessler, SIAM J. Numer. Anal. 48 (2010) 922, theorem 5.? (order conditions for additive noise).
+    """
+
+    def __init__(self, layer: Layer) -> None:
+        _need_exact_contacts(layer)
+        self._layer = layer
+        self._noise = math.sqrt(2.0 * layer.scene.D_r)
+        self._stiff = StiffPart(layer)
+        shape = (len(layer.radius), layer.n_columns)
+        self._stage, self._drift, self._first, self._second = (np.empty(shape) for _ in range(4))
+        self.error = 0.0
+
+    def restart(self) -> None:
+        """Nothing is remembered from step to step."""
+
+    def step(self, state: Floats, h: float, w: Floats, area: Floats) -> None:
+        """Advance by two evaluations and two linear solves with one matrix."""
+        stiff, stage, drift = self._stiff, self._stage, self._drift
+        first, second = self._first, self._second
+        np.copyto(stage, state)
+        if self._noise > 0.0:
+            stage[:, 2] += self._noise * ((0.5 - EARLY) * w + area)
         self._layer.velocity(stage, drift)
-        np.multiply(drift, 0.5 * h * self._inverse, out=right)
-        right -= 0.5 * first
-        self._solve(h, self._second)
-        np.multiply(second, self._scale, out=drift)
-        self.error = float(np.sqrt(np.mean(np.sum(drift[:, :2] ** 2, axis=1))))
-        np.add(stage, drift, out=state)
+        drift *= h
+        stiff.collect()
+        g = h * min(_share(h * stiff.mean), 2.0)
+        z = h * stiff.tension
+        diagonal = (z * np.minimum(0.5 * (1.0 + z), 1.0 + math.sqrt(0.5))).astype(np.float32)
+        turned = stage[:, 2].copy()
+        stiff.solve(stage, drift, g, diagonal, first)
+        np.add(state, first, out=stage)
+        if self._noise > 0.0:
+            stage[:, 2] += self._noise * ((0.5 + EARLY) * w + area)
+        self._layer.velocity(stage, drift)
+        drift *= h
+        drift -= 2.0 * first
+        stage[:, 2] = turned  # the frame in which the stiff part was collected
+        stiff.solve(stage, drift, g, diagonal, second)
+        second += first
+        second *= 0.5
+        self.error = float(np.sqrt(np.mean(np.sum(second[:, :2] ** 2, axis=1))))
+        state += first
+        state += second
+        if self._noise > 0.0:
+            state[:, 2] += self._noise * w
 
 
-CG_TOLERANCE = 3e-2
-CG_MOST = 200
+SLACK = 0.3  # h times a stiffness below which a step needs no linear algebra
+LOOK_EVERY = 32  # such steps after which the contacts are looked at again
+EARLY = 1.0 / math.sqrt(6.0)  # of W, by which the two looks at the path differ from its middle
+MOST_SHARE = 3.0  # larger ones only hold the layer back
+
+
+def _share(z: float) -> float:
+    """The factor c of the stiff part in a step of h times its mean stiffness z."""
+    return min(MOST_SHARE, 0.5 * (1.0 + z))
+
+
+def _need_exact_contacts(layer: Layer) -> None:
+    if layer.contact != "exact" or layer.scene.rigid:
+        raise InputError(
+            "implicit integrators need deformable cells and the exact contact rule; "
+            "choose integrator euler."
+        )
 
 
 @dataclass(frozen=True)
@@ -179,7 +238,8 @@ METHODS: dict[str, Method] = {
     "euler": Method(Euler, 0.005),
     "sra1": Method(Sra1, 0.01),
     "implicit": Method(Implicit, 0.1),
-    "adaptive": Method(Implicit, 0.1, adaptive=True),
+    "rosenbrock": Method(Rosenbrock, 0.1),
+    "adaptive": Method(Rosenbrock, 0.1, adaptive=True),
 }
 
 

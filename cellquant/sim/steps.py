@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cellquant.sim.contacts import Layer
-from cellquant.sim.integrators import Implicit, find_method
+from cellquant.sim.integrators import Rosenbrock, find_method
 from cellquant.sim.noise import BrownianTree
 from cellquant.sim.scene import SimulationFailure
 
@@ -92,6 +92,7 @@ class FixedSteps:
         """Advance a state over one frame interval, in place."""
         steps = self.plan.steps_per_frame
         before = np.empty_like(state)
+        self._method.restart()
         for index in range(interval * steps, (interval + 1) * steps):
             before[:] = state
             try:
@@ -178,7 +179,7 @@ class AdaptiveSteps:
         self.elapsed = 0.0
         self._tolerance = tolerance
         self._span = plan.h * plan.steps_per_frame
-        self._method = Implicit(layer)
+        self._method = Rosenbrock(layer)
         self._tree = BrownianTree(layer.scene.seed, len(layer.radius), self._span)
         self._still = np.zeros(len(layer.radius))
         first = find_method("implicit")[1].dt

@@ -7,174 +7,330 @@ meet under the angle psi adds
 .. math:: k\, w w^T / \sin\psi, \qquad w = (u_i, u_j),
 
 which is positive and of rank one. Scaled by the square roots of the mobilities the operator
-1 + h S H S is symmetric and positive, and conjugate gradients need a handful of products that cost
-a few per cent of a force evaluation each.
+1 + g S H S is symmetric and positive, and conjugate gradients need few products. The modes are
+turned into the frame of the laboratory, where w needs no polarity. The operator only steadies a
+step, so single precision is enough: it halves the traffic and doubles the lanes.
 """
 
 import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
 
+from cellquant.sim.contacts import Layer
 from cellquant.sim.kernels import HEAD
 
-LEAST_SINE = 0.1  # smaller angles, of grazing contacts, would only cost iterations
+Floats = NDArray[np.float64]
+CG_TOLERANCE = 3e-2
+CG_MOST = 200
+LEAST_SINE = 0.05  # smaller angles, of grazing contacts, would only cost iterations
+FLAGS = {"contract", "reassoc", "nsz", "arcp"}
+LOOSE = ("contract", "reassoc", "nsz")  # NaN stays what it is
+LANES = 8  # numbers of single precision in a vector register
 
 
-@njit(cache=True, error_model="numpy")
+def row_length(n_modes: int) -> int:
+    """Columns of a cell in single precision, padded to whole vector registers."""
+    return LANES * ((2 + LANES + 2 * n_modes) // LANES)
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def normal_displacement(
-    state: Any, radius: Any, record: Any, i: int, c: float, s: float, rho: float, scale: Any,
-    row: Any,
+    radius: Any, record: Any, i: int, c: float, s: float, rho: float, scale: Any, modes: Any,
+    weight: Any, row: int, offset: int,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Fill `row` with u times `scale`; return the unit tangent and the unscaled turning part."""
-    n_modes = (state.shape[1] - 3) // 2
-    cos_1 = c * math.cos(state[i, 2]) + s * math.sin(state[i, 2])
-    sin_1 = s * math.cos(state[i, 2]) - c * math.sin(state[i, 2])
+    """Write u times `scale` into a row; return the unit tangent and the square of what it wrote."""
     slope = 0.0
     zr = c
     zi = s
-    for m in range(n_modes):
+    for m in range(len(modes)):
         zr, zi = zr * c - zi * s, zr * s + zi * c
-        slope -= (m + 2) * (record[i, HEAD + m] * zi + record[i, HEAD + n_modes + m] * zr)
+        slope -= (m + 2) * (record[i, HEAD + m] * zi + record[i, HEAD + len(modes) + m] * zr)
     tx = slope * c - rho * s
     ty = slope * s + rho * c
-    inverse = 1.0 / math.sqrt(tx * tx + ty * ty)
+    inverse = 1.0 / math.sqrt(max(tx * tx + ty * ty, 1e-24))
     tx *= inverse
     ty *= inverse
-    turning = -rho * slope * inverse
-    row[0] = ty * scale[0]
-    row[1] = -tx * scale[1]
-    row[2] = turning * scale[2]
-    radial = radius[i] * rho * inverse
-    a0 = record[i, 2] / radius[i]
-    cn = cos_1
-    sn = sin_1
-    for m in range(n_modes):
-        cn, sn = cn * cos_1 - sn * sin_1, sn * cos_1 + cn * sin_1
-        row[3 + m] = radial * (cn - 0.5 * state[i, 3 + m] / a0) * scale[3 + m]
-        b = state[i, 3 + n_modes + m]
-        row[3 + n_modes + m] = radial * (sn - 0.5 * b / a0) * scale[3 + n_modes + m]
-    return tx, ty, turning
+    turning = -rho * slope * inverse * scale[2]
+    weight[row, offset] = ty * scale[0]
+    weight[row, offset + 1] = -tx * scale[1]
+    weight[row, offset + 2] = turning
+    square = scale[0] * scale[0] + turning * turning
+    if len(modes) > 0:
+        radial = radius[i] * rho * inverse * scale[3]
+        half = 0.5 / record[i, 2]
+        zr = c
+        zi = s
+        for m in range(len(modes)):
+            zr, zi = zr * c - zi * s, zr * s + zi * c
+            along = radial * (zr - half * record[i, HEAD + m])
+            across = radial * (zi + half * record[i, HEAD + len(modes) + m])
+            weight[row, offset + 3 + m] = along
+            weight[row, offset + 3 + len(modes) + m] = across
+            square += along * along + across * across
+    return tx, ty, square
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def gather(
-    state: Any, radius: Any, record: Any, first: Any, other: Any, root_first: Any, root_last: Any,
-    roots: Any, scale: Any, k: float, weight: Any, factor: Any, turning: Any, cells: Any,
-) -> int:  # fmt: skip
-    """Collect the vectors w of all crossings; return their number (larger than the room: none)."""
+    radius: Any, record: Any, first: Any, other: Any, root_first: Any, root_last: Any, roots: Any,
+    scale: Any, k: float, modes: Any, weight: Any, factor: Any, cells: Any,
+) -> tuple[int, float]:  # fmt: skip
+    """Collect w and k / sin(psi) of all crossings.
+
+    Returns their number (where it exceeds the room, the rest is not stored), and the mean
+    stiffness 2 k |w|^2 / sin(psi) of a contact with two of them, per time.
+    """
     room = weight.shape[0]
     width = weight.shape[1] // 2
     count = 0
-    for i in range(state.shape[0]):
+    total = 0.0
+    for i in range(radius.shape[0]):
         for p in range(first[i], first[i + 1]):
             for r in range(root_first[p], root_last[p]):
                 if roots[r, 4] == 0.0 or roots[r, 5] == 0.0:
                     continue  # an arc that ends at the centre of a pinched cell, no crossing
                 if count < room:
                     j = other[p]
-                    ax, ay, turn_i = normal_displacement(
-                        state, radius, record, i, roots[r, 0], roots[r, 1], roots[r, 4], scale,
-                        weight[count, :width],
+                    ax, ay, square_i = normal_displacement(
+                        radius, record, i, roots[r, 0], roots[r, 1], roots[r, 4], scale, modes,
+                        weight, count, 0,
                     )  # fmt: skip
-                    bx, by, turn_j = normal_displacement(
-                        state, radius, record, j, roots[r, 2], roots[r, 3], roots[r, 5], scale,
-                        weight[count, width:],
+                    bx, by, square_j = normal_displacement(
+                        radius, record, j, roots[r, 2], roots[r, 3], roots[r, 5], scale, modes,
+                        weight, count, width,
                     )  # fmt: skip
-                    factor[count] = k / max(abs(ax * by - ay * bx), LEAST_SINE)
-                    turning[count, 0] = turn_i
-                    turning[count, 1] = turn_j
+                    rigidity = k / max(abs(ax * by - ay * bx), LEAST_SINE)
+                    factor[count] = rigidity
                     cells[count, 0] = i
                     cells[count, 1] = j
+                    total += 2.0 * rigidity * (square_i + square_j)
                 count += 1
-    return count
+    return count, total / max(1, count)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc"}, error_model="numpy")
-def add_turning(
-    count: int, weight: Any, factor: Any, turning: Any, cells: Any, turned: Any, h: float, out: Any
-) -> None:
-    """Subtract h S H nu from `out`, where nu turns the polarity of cell i by turned[i]."""
-    width = out.shape[1]
-    for r in range(count):
-        i = cells[r, 0]
-        j = cells[r, 1]
-        push = h * factor[r] * (turning[r, 0] * turned[i] + turning[r, 1] * turned[j])
-        for d in range(width):
-            out[i, d] -= push * weight[r, d]
-            out[j, d] -= push * weight[r, width + d]
+@intrinsic
+def push(
+    typing_context: Any, weight: Any, crossing: Any, direction: Any, product: Any, i: Any, j: Any,
+    coefficient: Any, modes: Any,
+) -> Any:  # fmt: skip
+    """Add coefficient w (w . direction) to `product` for one crossing, in vector registers.
+
+    Written as vector instructions, because a compiler that cannot exclude that `weight` and
+    `product` share memory leaves the loop scalar: this is six times faster.
+    """
+    chunks = row_length(modes.count) // LANES
+    signature = types.void(
+        weight, types.int64, direction, product, types.int64, types.int64, types.float32, modes
+    )
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        lanes = ir.VectorType(ir.FloatType(), LANES)
+
+        def rows(position: int, row: Any, offset: int) -> list[Any]:
+            array = context.make_array(signature.args[position])(
+                context, builder, arguments[position]
+            )
+            stride = (2 if position == 0 else 1) * chunks * LANES
+            start = builder.mul(row, ir.Constant(row.type, stride))
+            pointers = []
+            for chunk in range(chunks):
+                shift = ir.Constant(row.type, offset + chunk * LANES)
+                pointer = builder.gep(array.data, [builder.add(start, shift)])
+                pointers.append(builder.bitcast(pointer, lanes.as_pointer()))
+            return pointers
+
+        def load(pointers: list[Any]) -> list[Any]:
+            return [builder.load(pointer, align=4) for pointer in pointers]
+
+        _, crossing, _, _, i, j, coefficient, _ = arguments
+        own = load(rows(0, crossing, 0))
+        other = load(rows(0, crossing, chunks * LANES))
+        moved = load(rows(2, i, 0)) + load(rows(2, j, 0))
+        total = None
+        for a, b in zip(own + other, moved, strict=True):
+            term = builder.fmul(a, b, flags=LOOSE)
+            total = term if total is None else builder.fadd(total, term, flags=LOOSE)
+        name = f"llvm.vector.reduce.fadd.v{LANES}f32"
+        kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), lanes])
+        add_lanes = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module, kind, name
+        )
+        zero = ir.Constant(ir.FloatType(), 0.0)
+        dot = builder.call(add_lanes, [zero, total], fastmath=LOOSE)
+        dot = builder.fmul(dot, coefficient)
+        spread = ir.Constant(lanes, ir.Undefined)
+        for lane in range(LANES):
+            at = ir.Constant(ir.IntType(32), lane)
+            spread = builder.insert_element(spread, dot, at)
+        for row, vectors in ((i, own), (j, other)):
+            pointers = rows(3, row, 0)
+            for pointer, vector in zip(pointers, vectors, strict=True):
+                term = builder.fmul(vector, spread, flags=("contract",))
+                value = builder.fadd(builder.load(pointer, align=4), term, flags=("contract",))
+                builder.store(value, pointer, align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
 
 
-@njit(cache=True, fastmath={"contract", "reassoc"}, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def multiply(
-    count: int, weight: Any, factor: Any, cells: Any, h: float, modes: Any, direction: Any,
+    count: int, weight: Any, factor: Any, cells: Any, g: float, modes: Any, direction: Any,
     product: Any,
 ) -> None:  # fmt: skip
-    """Add h S H direction to `product`; rows have a padded length known to the compiler."""
-    width = 8 * ((10 + 2 * len(modes)) // 8)
+    """Add g S H S direction to `product`."""
+    share = np.float32(g)
     for r in range(count):
         i = cells[r, 0]
         j = cells[r, 1]
-        dot = 0.0
-        for d in range(width):
-            dot += weight[r, d] * direction[i, d]
-        for d in range(width):
-            dot += weight[r, width + d] * direction[j, d]
-        dot *= h * factor[r]
-        for d in range(width):
-            product[i, d] += dot * weight[r, d]
-        for d in range(width):
-            product[j, d] += dot * weight[r, width + d]
+        push(weight, r, direction, product, i, j, share * factor[r], modes)  # type: ignore[call-arg]
 
 
-@njit(cache=True, fastmath={"contract", "reassoc"}, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def solve(
-    count: int, weight: Any, factor: Any, cells: Any, diagonal: Any, h: float, modes: Any,
-    right: Any, tolerance: float, most: int, out: Any, residual: Any, direction: Any, product: Any,
+    state: Any, right: Any, scale: Any, count: int, weight: Any, factor: Any, cells: Any,
+    diagonal: Any, g: float, modes: Any, tolerance: float, most: int, work: Any, out: Any,
 ) -> int:  # fmt: skip
-    """Solve (1 + h diag + h S H S) out = right by conjugate gradients; return the iterations.
+    """Solve (1 + diag + g M H) out = right by conjugate gradients; return the iterations.
 
-    All arrays have rows padded with zeros to a multiple of 8.
+    `right` and `out` have the columns of a state; `work` is (5, N, padded columns). Where `right`
+    is not finite, neither is `out`.
     """
-    x = out.reshape(-1)
-    b = right.reshape(-1)
-    rest = residual.reshape(-1)
-    along = direction.reshape(-1)
-    image = product.reshape(-1)
+    n_cells = state.shape[0]
+    n_modes = len(modes)
+    fixed = work[0]
+    rest = work[1]
+    along = work[2]
+    image = work[3]
+    x = work[4]
+    for i in range(n_cells):
+        for d in range(3):
+            fixed[i, d] = right[i, d] / scale[d] if scale[d] > 0.0 else 0.0
+        if n_modes > 0:
+            inverse = 1.0 / scale[3] if scale[3] > 0.0 else 0.0
+            c = math.cos(state[i, 2])
+            s = math.sin(state[i, 2])
+            zr = c
+            zi = s
+            for m in range(n_modes):
+                zr, zi = zr * c - zi * s, zr * s + zi * c
+                a = right[i, 3 + m] * inverse
+                b = right[i, 3 + n_modes + m] * inverse
+                fixed[i, 3 + m] = a * zr - b * zi
+                fixed[i, 3 + n_modes + m] = b * zr + a * zi
+    b_flat = fixed.reshape(-1)
+    x_flat = x.reshape(-1)
+    rest_flat = rest.reshape(-1)
+    along_flat = along.reshape(-1)
+    image_flat = image.reshape(-1)
     stiff = diagonal.reshape(-1)
-    square = 0.0
-    for n in range(x.shape[0]):
-        x[n] = 0.0
-        rest[n] = b[n]
-        along[n] = b[n]
-        square += b[n] * b[n]
-    limit = tolerance * tolerance * square
+    square = np.float32(0.0)
+    for n in range(x_flat.shape[0]):
+        x_flat[n] = np.float32(0.0)
+        rest_flat[n] = b_flat[n]
+        along_flat[n] = b_flat[n]
+        square += b_flat[n] * b_flat[n]
+    if not math.isfinite(square):
+        out[:] = math.nan
+        return 0
+    limit = np.float32(tolerance * tolerance) * square
+    done = most
     for iteration in range(most):
         if not square > limit:
-            return iteration
-        for n in range(x.shape[0]):
-            image[n] = along[n] * (1.0 + h * stiff[n])
-        multiply(count, weight, factor, cells, h, modes, direction, product)
-        curvature = 0.0
-        for n in range(x.shape[0]):
-            curvature += along[n] * image[n]
+            done = iteration
+            break
+        for n in range(x_flat.shape[0]):
+            image_flat[n] = along_flat[n] * (np.float32(1.0) + stiff[n])
+        multiply(count, weight, factor, cells, g, modes, along, image)
+        curvature = np.float32(0.0)
+        for n in range(x_flat.shape[0]):
+            curvature += along_flat[n] * image_flat[n]
         alpha = square / curvature
-        fresh = 0.0
-        for n in range(x.shape[0]):
-            x[n] += alpha * along[n]
-            rest[n] -= alpha * image[n]
-            fresh += rest[n] * rest[n]
+        fresh = np.float32(0.0)
+        for n in range(x_flat.shape[0]):
+            x_flat[n] += alpha * along_flat[n]
+            rest_flat[n] -= alpha * image_flat[n]
+            fresh += rest_flat[n] * rest_flat[n]
         beta = fresh / square
-        for n in range(x.shape[0]):
-            along[n] = rest[n] + beta * along[n]
+        for n in range(x_flat.shape[0]):
+            along_flat[n] = rest_flat[n] + beta * along_flat[n]
         square = fresh
-    return most
+    for i in range(n_cells):
+        for d in range(3):
+            out[i, d] = scale[d] * x[i, d]
+        if n_modes > 0:
+            c = math.cos(state[i, 2])
+            s = math.sin(state[i, 2])
+            zr = c
+            zi = s
+            for m in range(n_modes):
+                zr, zi = zr * c - zi * s, zr * s + zi * c
+                a = scale[3] * x[i, 3 + m]
+                b = scale[3] * x[i, 3 + n_modes + m]
+                out[i, 3 + m] = a * zr + b * zi
+                out[i, 3 + n_modes + m] = b * zr - a * zi
+    return done
 
 
-def square_roots_of_mobilities(mu_r: float, mu_theta: float, mu_ab: float, modes: int) -> Any:
-    """The scaling S as a row over the coordinates of a cell."""
-    row = np.full(3 + 2 * (modes - 1), math.sqrt(mu_ab))
-    row[:2] = math.sqrt(mu_r)
-    row[2] = math.sqrt(mu_theta)
-    return row
+class StiffPart:
+    """The stiff part M H of one layer: collected at a state, then solved with.
+
+    Attributes
+    ----------
+    mean
+        Mean stiffness of a contact at the last state collected, 1/t0.
+    tension
+        (N, padded columns) stiffness of the shape modes by the line tension, 1/t0.
+    iterations
+        Products with M H made so far.
+    """
+
+    def __init__(self, layer: Layer) -> None:
+        scene = layer.scene
+        n_cells = len(layer.radius)
+        self._layer = layer
+        self._modes = (0,) * (scene.modes - 1)
+        self._scale = np.full(layer.n_columns, math.sqrt(scene.mu_ab))
+        self._scale[:2] = math.sqrt(scene.mu_r)
+        self._scale[2] = math.sqrt(scene.mu_theta)
+        self._width = row_length(len(self._modes))
+        n = np.arange(2, scene.modes + 1)
+        stretch = np.tile(n**2 - 1.0, 2)
+        self.tension = np.zeros((n_cells, self._width))
+        self.tension[:, 3 : layer.n_columns] = (
+            scene.mu_ab * scene.eta * math.pi * layer.radius[:, None] * stretch
+        )
+        self.mean = 0.0
+        self.iterations = 0
+        self._count = 0
+        self._work = np.zeros((5, n_cells, self._width), np.float32)
+        self._allocate(8 * n_cells)
+
+    def collect(self) -> None:
+        """Take the crossings of the state that the layer evaluated last."""
+        while True:
+            self._count, self.mean = gather(
+                self._layer.radius, *self._layer.crossings, self._scale,  # type: ignore[call-arg]
+                self._layer.scene.k, self._modes, self._weight, self._factor, self._cells,
+            )  # fmt: skip
+            if self._count <= len(self._factor):
+                return
+            self._allocate(self._count + self._count // 4)
+
+    def solve(self, state: Floats, right: Floats, g: float, diagonal: Any, out: Floats) -> None:
+        """Solve (1 + diagonal + g M H) out = right to CG_TOLERANCE; `state` as when collected."""
+        self.iterations += solve(
+            state, right, self._scale, self._count, self._weight, self._factor, self._cells,
+            diagonal, g, self._modes, CG_TOLERANCE, CG_MOST, self._work, out,
+        )  # fmt: skip
+
+    def _allocate(self, room: int) -> None:
+        self._weight = np.zeros((room, 2 * self._width), np.float32)
+        self._factor = np.empty(room, np.float32)
+        self._cells = np.empty((room, 2), np.int64)
