@@ -254,58 +254,6 @@ def test_two_cells_head_on_stop_where_push_and_drive_balance():
     assert distance == pytest.approx(2 * np.sqrt(0.25 - 0.1**2), rel=1e-6)
 
 
-def test_measured_strong_orders_of_free_walkers():
-    """Euler converges with order 1, SRA1 with 1.5, on the paths of one Brownian tree."""
-    from cellquant.sim.contacts import Layer
-    from cellquant.sim.initial import initial_state
-    from cellquant.sim.integrators import METHODS
-
-    scene = Scene(n_cells=300, phi=0.0005, v0=0.5, D_r=0.5, modes=1, eta=0.0)
-    start, radius, box = initial_state(scene)
-    tree = BrownianTree(5, 300, 2.0)
-
-    def end(name, depth):
-        method = METHODS[name].make(Layer(scene, radius, box))
-        state = start.copy()
-        w, area = tree.level(0, depth)
-        for index in range(2**depth):
-            method.step(state, 2.0 / 2**depth, w[index], area[index])
-        return state[:, :2]
-
-    exact = end("sra1", 11)
-
-    def order(name):
-        coarse, fine = (np.sqrt(np.mean((end(name, d) - exact) ** 2)) for d in (3, 6))
-        return np.log2(coarse / fine) / 3
-
-    assert order("euler") == pytest.approx(1.0, abs=0.15)
-    assert order("sra1") == pytest.approx(1.5, abs=0.2)
-
-
-def test_implicit_and_euler_steps_meet_on_a_dense_layer():
-    """Both methods approach one trajectory as their steps shrink."""
-    from cellquant.sim.contacts import Layer
-    from cellquant.sim.initial import initial_state
-    from cellquant.sim.integrators import METHODS
-
-    scene = Scene(n_cells=36)
-    start, radius, box = initial_state(scene)
-    tree = BrownianTree(5, 36, 1.0)
-
-    def end(name, depth):
-        method = METHODS[name].make(Layer(scene, radius, box))
-        state = start.copy()
-        w, area = tree.level(0, depth)
-        for index in range(2**depth):
-            method.step(state, 1.0 / 2**depth, w[index], area[index])
-        return state[:, :2]
-
-    exact = end("euler", 10)
-    errors = [np.sqrt(np.mean((end("implicit", d) - exact) ** 2)) for d in (3, 5, 7)]
-    assert errors[0] < 5e-3
-    assert errors[2] < 0.5 * errors[1] < 0.5 * errors[0]
-
-
 def test_adaptive_run_keeps_its_path_and_resumes(tmp_path, monkeypatch):
     scene = Scene(n_cells=16)
     whole = simulate(scene, duration=4, tolerance=2e-3)

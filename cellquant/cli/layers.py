@@ -151,6 +151,20 @@ def convergence(
     cells: Annotated[int | None, typer.Option(help="Number of cells.")] = None,
     duration: Annotated[float, typer.Option(help="Time of the comparison, t0.")] = 4.0,
     transient: Annotated[float, typer.Option(help="Time before it, t0.")] = 60.0,
+    weak_duration: Annotated[
+        float, typer.Option(help="Length of the runs for the errors of averages, t0; 0 for none.")
+    ] = 200.0,
+    seeds: Annotated[
+        list[int] | None, typer.Option("--seed", help="A repetition; may be given repeatedly.")
+    ] = None,
+    points: Annotated[
+        list[int] | None,
+        typer.Option(help="Contour points of the quadrature rule; may be given repeatedly."),
+    ] = None,
+    integrators: Annotated[
+        list[str] | None,
+        typer.Option("--integrator", help="One to measure; may be given repeatedly."),
+    ] = None,
 ) -> None:
     """Measure error against run time of contact rules, integrators and steps."""
     from cellquant.config import SceneConfig, read_toml, validate
@@ -169,14 +183,13 @@ def convergence(
             output,
             duration=duration,
             transient=transient,
+            weak_duration=weak_duration,
+            seeds=seeds or (1, 2, 3),
+            points=points or (40,),
+            integrators=integrators,
             progress=progress,
         )
-    for name, value in found.recommendation.items():
-        say(
-            f"{name.replace('_', ' ')}: {value:.4g}"
-            if isinstance(value, float)
-            else f"{name.replace('_', ' ')}: {value}"
-        )
+    say(found.recommendation["text"])
     note(f"wrote {output / 'convergence.parquet'}")
 
 

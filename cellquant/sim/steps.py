@@ -171,7 +171,9 @@ class AdaptiveSteps:
         Time since the start of the frame interval, t0.
     """
 
-    def __init__(self, layer: Layer, plan: Plan, tolerance: float) -> None:
+    def __init__(
+        self, layer: Layer, plan: Plan, tolerance: float, tree: BrownianTree | None = None
+    ) -> None:
         self.layer = layer
         self.count = 0
         self.rejected = 0
@@ -180,7 +182,7 @@ class AdaptiveSteps:
         self._tolerance = tolerance
         self._span = plan.h * plan.steps_per_frame
         self._method = Rosenbrock(layer)
-        self._tree = BrownianTree(layer.scene.seed, len(layer.radius), self._span)
+        self._tree = tree or BrownianTree(layer.scene.seed, len(layer.radius), self._span)
         self._still = np.zeros(len(layer.radius))
         first = find_method("implicit")[1].dt
         self._depth = max(0, math.ceil(math.log2(self._span / first)))
