@@ -1,112 +1,155 @@
-"""Simulated values beside the published ones, for both contact rules, several seeds.
+"""Simulated values beside the published ones, for both contact rules, several seeds and sizes.
 
-Runs are kept in a folder and resumed, so that the table can be made longer at any time:
+Runs are kept in a folder and resumed; what is there is measured, however long it is:
 
-    python benchmarks/published_values.py --folder RUNS --cells 256 --transient 2000 --duration 2000
+    python benchmarks/published_values.py simulate --folder RUNS --rule exact --cells 256 --seed 1
+    python benchmarks/published_values.py measure --folder RUNS
+
+A run starts from a hexagonal lattice. The transient left out is the shortest of 0.1, 0.2, ... 0.6
+of the run after which `Run.stationarity` sees no drift of <p>; where there is none, the second half
+is measured and the row says that it drifts.
 """
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from cellquant.observables import observe
-from cellquant.sim import Scene, SimulationFailure, simulate
+from cellquant.sim import Scene, open_run, simulate
+from cellquant.tables import TRACK_COLUMNS
 
 RESULTS = Path(__file__).parent / "results"
-POINTS = [
-    {
-        "phi": 0.97,
-        "v0": 0.03,
-        "eta": 0.01,
-        "published": {"p": 3.800, "sigma2": 0.103, "xi": 0.0692},
-    },
-    {"phi": 0.95, "v0": 0.03, "eta": 0.01, "published": {"p": 3.751}},
-]
-RULES = {
-    "exact, implicit": {"contact": "exact"},
-    "40 points, euler 0.005": {"contact": "quadrature", "integrator": "euler", "dt": 0.005},
+PUBLISHED = {
+    (0.97, 0.03, 0.01): {"p": 3.800, "sigma2": 0.103, "xi": 0.0692},
+    (0.95, 0.03, 0.01): {"p": 3.751},
 }
+RULES = {
+    "exact": {"contact": "exact"},
+    "40points": {"contact": "quadrature", "integrator": "euler", "dt": 0.005},
+}
+LONG = 20_000.0  # t0 that a run may go on for; it is measured whenever one likes
+SAVE_EVERY = 5.0
+LEAST = 300.0  # t0 below which a run is not measured
+KEYS = ("p", "drift", "tau_alpha", "sigma2", "xi", "pinched_share", "length", "transient")
 
 
-def measure(run):
-    """Shape index, its drift, and the relaxation of one run."""
-    series = run.mean_shape_index()
-    half = len(series) // 2
-    found = {
-        "p": float(series.mean()),
-        "p_drift": float(series[half:].mean() - series[:half].mean()),
-        "cpu_seconds": run.work["cpu_seconds"],
-    }
-    summary = observe(run.to_tracks(), only=["tau_alpha", "van_hove"]).summary
+def go_on(options):
+    """Simulate one layer until it is stopped."""
+    scene = Scene(
+        n_cells=options.cells, phi=options.phi, v0=options.v0, eta=options.eta, seed=options.seed
+    )
+    point = f"{options.phi}_{options.v0}_{options.eta}"
+    name = f"{options.rule}_{options.cells}_{point}_{options.seed}.zarr"
+    simulate(
+        scene, duration=LONG, save_every=SAVE_EVERY, output=options.folder / name,
+        **RULES[options.rule],
+    )  # fmt: skip
+
+
+def steady_part(run):
+    """(first frame, test): the shortest transient after which <p> does not drift."""
+    for tenths in range(1, 7):
+        start = run.n_frames * tenths // 10
+        test = run.stationarity(start=start)
+        if test.stationary:
+            return start, test
+    start = run.n_frames // 2
+    return start, run.stationarity(start=start)
+
+
+def measure(path):
+    """Shape index, its drift, and the relaxation of the steady part of one run."""
+    run = open_run(path)
+    scene = run.scene
+    rule = "exact" if run.settings["contact"] == "exact" else "40points"
+    start, test = steady_part(run)
+    shapes = ("perimeter", "shape_index", "aspect_ratio", "orientation", "n_neighbours")
+    tracks = run.to_tracks(columns=[name for name in TRACK_COLUMNS if name not in shapes])
+    late = tracks.table[tracks.table["frame"] >= start].copy()
+    late["frame"] -= start
+    late["time"] -= float(run.time[start])
+    summary = observe(replace(tracks, table=late), only=["tau_alpha", "van_hove"]).summary
     hove = summary.get("van_hove") or {}
-    return found | {
+    series = run.mean_shape_index()
+    return {
+        "rule": rule,
+        "cells": scene.n_cells,
+        "phi": scene.phi,
+        "v0": scene.v0,
+        "eta": scene.eta,
+        "seed": scene.seed,
+        "length": float(run.time[-1]),
+        "transient": float(run.time[start]),
+        "stationary": test.stationary,
+        "p": float(series[start:].mean()),
+        "drift": test.drift,
+        "drift_std_error": test.std_error,
+        "p_300": float(series[run.time <= 300.0][-20:].mean()),
+        "p_1000": float(series[run.time <= 1000.0][-20:].mean()) if run.time[-1] > 1000 else None,
         "tau_alpha": summary["tau_alpha"]["value"],
+        "censored_at": summary["tau_alpha"]["censored_at"],
         "sigma2": hove.get("sigma2"),
         "xi": hove.get("xi"),
+        "pinched_share": float(np.mean(pinched_share(run)[start:])),
     }
+
+
+def pinched_share(run):
+    from cellquant.sim.shapes import pinched
+
+    modes, polarity = run.modes, run.polarity
+    return np.array(
+        [pinched(modes[t], polarity[t], run.radius).mean() for t in range(run.n_frames)]
+    )
+
+
+def tabulate(rows):
+    """Means over the seeds and their standard errors, beside the published values."""
+    table = []
+    for key in sorted({(r["rule"], r["cells"], r["phi"], r["v0"], r["eta"]) for r in rows}):
+        rule, cells, phi, v0, eta = key
+        chosen = [r for r in rows if (r["rule"], r["cells"], r["phi"], r["v0"], r["eta"]) == key]
+        entry = {
+            "rule": rule, "cells": cells, "phi": phi, "v0": v0, "eta": eta,
+            "n_seeds": len(chosen), "n_stationary": sum(r["stationary"] for r in chosen),
+            "published": PUBLISHED.get((phi, v0, eta), {}),
+        }  # fmt: skip
+        for name in KEYS:
+            values = np.array([r[name] for r in chosen if r[name] is not None], float)
+            if len(values):
+                entry[name] = float(values.mean())
+            if len(values) > 1:
+                entry[name + "_std_error"] = float(values.std(ddof=1) / np.sqrt(len(values)))
+        table.append(entry)
+    return table
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("task", choices=["simulate", "measure"])
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--rule", choices=sorted(RULES), default="exact")
     parser.add_argument("--cells", type=int, default=1024)
-    parser.add_argument("--transient", type=float, default=5000.0)
-    parser.add_argument("--duration", type=float, default=5000.0)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--save-every", type=float, default=5.0)
+    parser.add_argument("--phi", type=float, default=0.97)
+    parser.add_argument("--v0", type=float, default=0.03)
+    parser.add_argument("--eta", type=float, default=0.01)
+    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    if options.task == "simulate":
+        go_on(options)
+        return
     rows = []
-    for rule, settings in RULES.items():
-        for point in POINTS:
-            scene = {k: v for k, v in point.items() if k != "published"}
-            for seed in options.seeds:
-                name = f"{rule.split(',')[0].replace(' ', '')}_{scene['phi']}_{seed}.zarr"
-                try:
-                    run = simulate(
-                        Scene(n_cells=options.cells, seed=seed, **scene),
-                        duration=options.duration,
-                        transient=options.transient,
-                        save_every=options.save_every,
-                        output=options.folder / name,
-                        **settings,
-                    )
-                except SimulationFailure as failure:
-                    rows.append({"rule": rule, **scene, "seed": seed, "failure": str(failure)})
-                    print(rows[-1], flush=True)
-                    continue
-                rows.append({"rule": rule, **scene, "seed": seed, **measure(run)})
-                print(rows[-1], flush=True)
-                write(rows, options)
-
-
-def write(rows, options):
-    """Means over the seeds and their standard errors, beside the published values."""
-    table = []
-    for rule in RULES:
-        for point in POINTS:
-            chosen = [
-                r for r in rows if r["rule"] == rule and r["phi"] == point["phi"] and "p" in r
-            ]
-            if not chosen:
-                continue
-            entry = {"rule": rule, **point, "n_seeds": len(chosen)}
-            for key in ("p", "p_drift", "tau_alpha", "sigma2", "xi", "cpu_seconds"):
-                values = np.array([r[key] for r in chosen if r[key] is not None], float)
-                if len(values):
-                    entry[key] = float(values.mean())
-                if len(values) > 1:
-                    entry[key + "_std_error"] = float(values.std(ddof=1) / np.sqrt(len(values)))
-            table.append(entry)
+    for path in sorted(options.folder.glob("*.zarr")):
+        run = open_run(path)
+        if run.n_frames < 2 or run.time[-1] < LEAST:
+            continue
+        rows.append(measure(path))
+        print(rows[-1], flush=True)
     RESULTS.mkdir(exist_ok=True)
-    content = {
-        "cells": options.cells,
-        "transient": options.transient,
-        "duration": options.duration,
-        "table": table,
-        "runs": rows,
-    }
+    content = {"table": tabulate(rows), "runs": rows}
     (RESULTS / "published_values.json").write_text(json.dumps(content, indent=1) + "\n")
 
 

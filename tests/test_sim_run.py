@@ -386,3 +386,21 @@ def test_scene_files_give_box_radii_and_initial_state():
     ):
         with pytest.raises(InputError, match=match):
             scene(**wrong)
+
+
+def test_a_growing_run_is_read_as_a_whole(tmp_path, monkeypatch):
+    """What is written after a run was opened does not mix into what is read of it."""
+    monkeypatch.setattr(run_module, "CHECKPOINT_EVERY", 0.0)
+    path, seen = tmp_path / "run.zarr", []
+
+    def look(done, total):
+        if done == 3:
+            seen.append(open_run(path))
+            assert seen[0].n_frames == 2
+        elif done == 5:
+            assert open_run(path).n_frames == 4
+            assert seen[0].to_tracks().table["frame"].max() == 1
+            assert len(seen[0].position) == len(seen[0].modes) == seen[0].n_frames == 2
+
+    simulate(SMALL, duration=6, dt=0.02, output=path, progress=look)
+    assert len(seen) == 1

@@ -140,6 +140,9 @@ class Stationarity:
 class Run:
     """A simulated run, in memory or on disk, finished or growing.
 
+    Of a growing run it shows the frames that were there when it was first asked for them, so that
+    its arrays belong together; open the run again to see more.
+
     Attributes
     ----------
     path
@@ -183,10 +186,10 @@ class Run:
 
     @property
     def n_frames(self) -> int:
-        """Number of frames written so far."""
+        """Number of frames."""
         return len(self.time)
 
-    @property
+    @cached_property
     def time(self) -> Floats:
         """(T,) time of the frames since the end of the transient, t0."""
         times = np.asarray(self._group["time"][:], np.float64)
@@ -244,18 +247,25 @@ class Run:
             ]
         )
 
-    def stationarity(self, n_blocks: int = 5) -> Stationarity:
+    def stationarity(self, n_blocks: int = 5, *, start: int = 0) -> Stationarity:
         """Test whether <p> still drifts: the halves of the run against their block errors.
 
         The difference of the two halves' means is compared with the standard error that `n_blocks`
         blocks per half give; a run is taken for stationary where it is within two errors.
+
+        Parameters
+        ----------
+        n_blocks
+            Blocks per half.
+        start
+            Frames before this one are left out, as a transient.
 
         Raises
         ------
         InputError
             If the run has fewer than four frames per block.
         """
-        series = self.mean_shape_index()
+        series = self.mean_shape_index()[start:]
         length = len(series) // (2 * n_blocks)
         if length < 4:
             raise InputError(
