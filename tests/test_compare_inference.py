@@ -8,8 +8,10 @@ import pandas as pd
 import pytest
 
 import cellquant as cq
+from cellquant.compare.calibration import Forecast, inflation_for, smallest_region
+from cellquant.compare.emulator import _left_out_predictions, train
 from cellquant.compare.groups import Group, read_groups
-from cellquant.compare.inference import fit_parameters, sensitivity, train
+from cellquant.compare.inference import fit_parameters, sensitivity
 from cellquant.compare.ranking import (
     REDUCED_UNITS,
     Units,
@@ -189,6 +191,46 @@ def test_what_is_refused(sweep: list[Group]) -> None:
                                               {}, {}),)}, {})  # fmt: skip
     with pytest.raises(InputError, match="no feature with a standard error in common"):
         rank_candidates(bare, sweep)
+
+
+def test_left_out_predictions_are_those_of_a_process_that_never_saw_the_scene() -> None:
+    from sklearn.gaussian_process import GaussianProcessRegressor
+
+    emulator = train(grid(), ("shape_index.mean",))
+    model = emulator.models[0]
+    points = np.random.default_rng(0).random((5, 3))
+    mean, deviation = _left_out_predictions(model, points)(7, range(5))
+    others = np.arange(len(model.X_train_)) != 7
+    y = model.y_train_ * model._y_train_std + model._y_train_mean
+    fresh = GaussianProcessRegressor(
+        model.kernel_, alpha=model.alpha[others] * model._y_train_std**2, optimizer=None
+    )
+    # The same prior in the units of the feature: covariance times the square of their scale.
+    fresh.kernel = model._y_train_std**2 * model.kernel_
+    fresh.fit(model.X_train_[others], y[others] - model._y_train_mean)
+    expected, spread = fresh.predict(points, return_std=True)
+    np.testing.assert_allclose(mean, expected + model._y_train_mean, rtol=1e-8)
+    np.testing.assert_allclose(deviation, spread, rtol=1e-5)
+
+
+@pytest.mark.parametrize("overstated", [0.4, 1.0, 2.0])
+def test_regions_are_widened_by_as_much_as_errors_are_too_small(overstated: float) -> None:
+    """One parameter measured directly, 400 times, with an error of 0.02 called something else."""
+    rng = np.random.default_rng(3)
+    said = 0.02 * overstated
+    prior = (np.arange(4096) + 0.5) / 4096
+    forecasts = []
+    for truth in rng.uniform(0.2, 0.8, 400):
+        seen = truth + 0.02 * rng.standard_normal()
+        place = np.append(prior, truth)
+        forecasts.append(
+            Forecast(((place - seen) / said) ** 2, np.full(4097, np.log(said)), 100_000)
+        )
+    found = inflation_for(forecasts, size=1)
+    assert found == pytest.approx(max(1.0, 1 / overstated), rel=0.12)
+    for level in (0.68, 0.95):
+        held = np.mean([smallest_region(f, found, size=1) <= level for f in forecasts])
+        assert held >= level
 
 
 @pytest.mark.slow
