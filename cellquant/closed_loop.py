@@ -5,6 +5,10 @@ They are told apart by observing the same layer after each of them, so that most
 noise is common to all: the run itself; the run at the frame interval of the camera; its true tracks
 in the field of view; the cells measured on the masks, with their true identities; and the tracks
 that were found.
+
+Movies are smoothed by default, over five points. That changes what is measured, truth included, so
+it is held apart: the tracks that were found and the run at the frame interval of the camera are
+observed once more, both smoothed.
 """
 
 from collections.abc import Mapping
@@ -36,6 +40,11 @@ STAGES = {
     "pixels": "cells measured on the masks, true identities",
     "found": "tracks found",
 }
+SMOOTHED = {
+    "truth_smoothed": "the run at the frame interval of the camera, smoothed over five points",
+    "found_smoothed": "tracks found, smoothed over five points",
+}
+SMOOTHING = 5  # points, the default for movies
 # What the step from one stage to the next adds.
 STEPS = {
     "sampled": "frame interval",
@@ -111,13 +120,15 @@ class Loop:
     run
         The simulated run.
     observed
-        Observables of every stage, by its name in `STAGES`; all with the same options.
+        Observables of every stage, by its name in `STAGES` and `SMOOTHED`.
     tracks
         The tracks found.
     record
         How they were found.
     table
         One row per quantity, see `closed_loop_table`.
+    settings
+        Scene, camera and smoothing.
     """
 
     run: "Run"
@@ -125,6 +136,7 @@ class Loop:
     tracks: "Tracks"
     record: RunRecord
     table: "pd.DataFrame"
+    settings: Mapping[str, Any]
 
 
 def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Loop:
@@ -137,7 +149,7 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
         five times as often.
     folder
         Output folder: ``run.zarr``, ``masks.tif`` with ``masks_truth``, a folder of observables
-        for each of `STAGES`, and ``closed_loop.json``.
+        for each of `STAGES` and `SMOOTHED`, and ``closed_loop.json``.
     step
         Gives a progress callback for each stage.
     """
@@ -161,24 +173,40 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
     masks = read_labels(folder / "masks.tif")
     cells, tracks, record = track_movie(masks, folder / "found", step=step)
     truth = run.to_tracks(columns=columns_read(WANTED))
+    sampled = _every(truth, FINER)
+    identified = _with_identities(cells, rendering.tracks)
     observed = {}
-    for name, origin, source in (
-        ("truth", "../run.zarr", truth),
-        ("sampled", "../run.zarr", _every(truth, FINER)),
-        ("field", "../masks_truth", rendering.tracks),
-        ("pixels", "../found/cells.parquet", _with_identities(cells, rendering.tracks)),
-        ("found", "../masks.tif", tracks),
+    for name, origin, source, points in (
+        ("truth", "../run.zarr", truth, 1),
+        ("sampled", "../run.zarr", sampled, 1),
+        ("field", "../masks_truth", rendering.tracks, 1),
+        ("pixels", "../found/cells.parquet", identified, 1),
+        ("found", "../masks.tif", tracks, 1),
+        ("truth_smoothed", "../run.zarr", sampled, SMOOTHING),
+        ("found_smoothed", "../found/tracks.parquet", tracks, SMOOTHING),
     ):
-        settings = {"source": origin, "stage": STAGES[name]}
+        settings = {
+            "source": origin,
+            "stage": (STAGES | SMOOTHED)[name],
+            "smoothing": points,
+            "only": list(WANTED),
+        }
         made = record if name == "found" else RunRecord("observe", settings)
-        # No smoothing: the simulation has no localisation noise, and the paths are compared.
-        options = {"smoothing": 1, "only": list(WANTED)}
+        options = {"smoothing": points, "only": list(WANTED)}
         observed[name] = observe_into(source, folder / name, made, options=options, step=step)
         made.write(folder / name)
     table = closed_loop_table({name: _values(o) for name, o in _with_msd(observed).items()})
     known = table.astype(object).where(table.notna(), None)
     write_json(folder / "closed_loop.json", known.to_dict("records"))
-    return Loop(run, observed, tracks, record, table)
+    made_with = {
+        **finer.model_dump(),
+        "um per L0": LENGTH,
+        "min per t0": TIME,
+        "um per pixel": PIXEL,
+        "frames of the run per frame of the camera": FINER,
+        "points of the smoothing, where smoothed": SMOOTHING,
+    }
+    return Loop(run, observed, tracks, record, table, made_with)
 
 
 def _every(tracks: "Tracks", step: int) -> "Tracks":
@@ -238,16 +266,18 @@ def closed_loop_table(stages: "Mapping[str, Mapping[str, tuple[float, float]]]")
     Parameters
     ----------
     stages
-        By the name of the stage (`STAGES`), for each quantity its value and standard error in
-        units of the model.
+        By the name of the stage (`STAGES` and `SMOOTHED`), for each quantity its value and
+        standard error in units of the model.
 
     Returns
     -------
     pandas.DataFrame
         quantity, unit, truth, truth_std_error, measured, measured_std_error, error
         (measured/truth - 1), then for each step its share: this stage over the one before,
-        minus 1. The speed is defined by the frame interval: its truth is the sampled run's. NaN
-        where a quantity could not be measured.
+        minus 1. The speed is defined by the frame interval: its truth is the sampled run's.
+        Then truth and measurement with both smoothed, ``smoothing_adds``: what smoothing changes
+        in the tracks found, not part of the error, and ``error_smoothed``: the error with both
+        smoothed. NaN where a quantity could not be measured.
     """
     import pandas as pd
 
@@ -270,5 +300,9 @@ def closed_loop_table(stages: "Mapping[str, Mapping[str, tuple[float, float]]]")
         }
         for before, after in pairwise(names):
             row[f"from_{STEPS[after].replace(' ', '_')}"] = values[after] / values[before] - 1.0
+        for name, column in (("truth_smoothed",) * 2, ("found_smoothed", "measured_smoothed")):
+            row[column], row[f"{column}_std_error"] = stages[name][label]
+        row["smoothing_adds"] = row["measured_smoothed"] / measured - 1.0
+        row["error_smoothed"] = row["measured_smoothed"] / row["truth_smoothed"] - 1.0
         rows.append(row)
     return pd.DataFrame(rows)

@@ -13,7 +13,7 @@ from cellquant.pipeline import Step, observe_into, silent, track_movie
 from cellquant.storage import RunRecord, atomic_path, check_output, write_json
 
 if TYPE_CHECKING:
-    from cellquant.compare.page import Headline, Page, Section
+    from cellquant.compare.page import Headline, Page, Section, Table
 
 
 def demo_scene(seed: int) -> SceneConfig:
@@ -58,18 +58,15 @@ def run_demo(out: str | Path, *, seed: int = 1, step: Step = silent) -> Path:
     from cellquant.compare.page import write_page
 
     folder = check_output(out)
+    scene = demo_scene(seed)
     record = RunRecord("demo", {"seed": seed})
     page = _analyse_recording(folder / "recording", record, step)
-    scene = demo_scene(seed)
     loop = close_loop(scene, folder / "layer", step=step)
     record.stages += loop.record.stages
     report = folder / "report.html"
     with record.stage("report"), step("report"):
         section = _loop_section(folder / "layer", loop, scene)
-        page = replace(
-            page, title="Simulation beside experiment", sections=(section, *page.sections)
-        )
-        write_page(page, report)
+        write_page(_joined(page, section, loop), report)
     record.write(folder)
     return report
 
@@ -90,6 +87,7 @@ def _analyse_recording(folder: Path, record: RunRecord, step: Step) -> "Page":
     cells, tracks, made = track_movie(masks, folder, step=step)
     observables = observe_into(tracks, folder, made, step=step)
     made.command = "demo"
+    made.inputs = {Path(name).name: digest for name, digest in made.inputs.items()}
     made.settings = {**record.settings, **made.settings}
     made.write(folder)
     record.stages += made.stages
@@ -104,6 +102,32 @@ def _analyse_recording(folder: Path, record: RunRecord, step: Step) -> "Page":
     )
 
 
+def _joined(recording: "Page", loop_section: "Section", loop: Loop) -> "Page":
+    """The closed loop first, then the recording, on one page."""
+    from cellquant.compare.page import Settings, flatten
+
+    first, *others, methods = recording.sections
+    settings = Settings("Settings of the closed loop", flatten(loop.settings))
+    methods = replace(methods, settings=(settings, *methods.settings))
+    opened = replace(
+        first,
+        title="A real recording: results",
+        text=(
+            f"{recording.title}; from here on the page is about this recording. {recording.lede}",
+            *first.text,
+        ),
+    )
+    return replace(
+        recording,
+        title="Simulation beside experiment",
+        lede="Part one: a simulated layer is filmed, measured like any movie, and held against "
+        "what is known of it. Part two: a real recording, measured by the same program. The "
+        "numbers below say how far the measurement was off.",
+        glance=_headlines(loop),
+        sections=(loop_section, opened, *others, methods),
+    )
+
+
 def _headlines(loop: Loop) -> "tuple[Headline, ...]":
     """Errors of the measurement on masks, by quantity."""
     from cellquant.compare.page import Headline
@@ -115,6 +139,7 @@ def _headlines(loop: Loop) -> "tuple[Headline, ...]":
     )
 
 
+_SMOOTHED = ("mean speed", "MSD at the relaxation time", "relaxation time")
 _UNITS = {
     "1": "",
     "L0": "L_{0}",
@@ -132,16 +157,23 @@ def _per_cent(share: float) -> str:
     return "not known" if isnan(share) else f"{100 * share:+.2f} %".replace("-", MINUS)
 
 
-def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
-    """The closed loop on the page: the table of errors and the two sides in matched figures."""
-    from cellquant.compare import matched_figures
-    from cellquant.compare.groups import read_groups
-    from cellquant.compare.page import Row, Section, Table, format_value
+_STEP_TEXTS = (
+    "Frame interval: the camera sees one state in five that the run saved; what happens in between "
+    "is not seen.",
+    "Field of view: cells that the edge cuts are left out, and with them a part of the layer. "
+    "This is the difference between a sample and the whole, not a fault of the measurement.",
+    "Pixels: cells are drawn on a grid, and where two overlap each pixel goes to one of them.",
+    "Linking: cells that were followed wrongly from frame to frame.",
+)
+
+
+def _error_table(loop: Loop) -> "Table":
+    """Truth, measurement, error and its parts."""
+    from cellquant.compare.page import Row, Table, format_value
 
     steps = [name for name in loop.table.columns if name.startswith("from_")]
     rows = []
-    for record in loop.table.to_dict("records"):
-        row: dict[str, Any] = {str(name): value for name, value in record.items()}
+    for row in _records(loop):
         shares = [float(row[name]) for name in ("error", *steps)]
         rows.append(
             Row(
@@ -155,13 +187,13 @@ def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
                 "none" if isnan(shares[0]) else "",
             )
         )
-    table = Table(
+    return Table(
         name="closed-loop",
         caption="Truth and measurement of the same layer, value ± standard error, in units of the "
         "model (L_{0}: diameter of a mean cell; t_{0}: time in which contact forces act; d: mean "
         "diameter as measured). Both show the same cells, so their difference is known better than "
-        "either. The error is made up of four: frames that are apart in time, the border of the "
-        "field of view, pixels, and linking. From layer/closed_loop.json.",
+        "either. Nothing is smoothed. The error is the product of the four steps named above. From "
+        "layer/closed_loop.json.",
         columns=(
             "Quantity",
             "Truth",
@@ -174,13 +206,56 @@ def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
         rows=tuple(rows),
         data=loop.table,
     )
+
+
+def _smoothing_table(loop: Loop) -> "Table":
+    """The same with the smoothing that movies get by default, on both sides."""
+    from cellquant.compare.page import Row, Table, format_value
+
+    rows = [
+        Row(
+            (
+                row["quantity"],
+                format_value(row["truth_smoothed"], row["truth_smoothed_std_error"]),
+                format_value(row["measured_smoothed"], row["measured_smoothed_std_error"]),
+                _UNITS[row["unit"]],
+                _per_cent(row["error_smoothed"]),
+                _per_cent(row["smoothing_adds"]),
+            )
+        )
+        for row in _records(loop)
+        if row["quantity"] in _SMOOTHED
+    ]
+    return Table(
+        name="closed-loop-smoothed",
+        caption="The same with trajectories smoothed over five points, as those of movies are by "
+        "default, on both sides. With ten frames in one relaxation time smoothing changes what is "
+        "measured by as much as the last column says: compare a smoothed movie with a smoothed "
+        "simulation only. From layer/closed_loop.json.",
+        columns=("Quantity", "Truth", "Measured", "Unit", "Error", "Smoothing changes it by"),
+        classes=("", "number", "number", "", "number", "number"),
+        rows=tuple(rows),
+    )
+
+
+def _records(loop: Loop) -> list[dict[str, Any]]:
+    return [{str(k): v for k, v in row.items()} for row in loop.table.to_dict("records")]
+
+
+def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
+    """The closed loop on the page: the table of errors and the two sides in matched figures."""
+    from cellquant.compare import matched_figures
+    from cellquant.compare.groups import read_groups
+    from cellquant.compare.page import Section
+
+    tables = (_error_table(loop), _smoothing_table(loop))
     groups = read_groups(
-        [folder / "found", folder / "truth"], names=["measured on masks", "simulation itself"]
+        [folder / "found", folder / "truth"], names=["measured on masks", "known truth"]
     )
     seen = matched_figures.add_sources(groups)
     figures = (
         matched_figures.layer_figure(seen),
-        matched_figures.paths_figure(seen),
+        *matched_figures.path_figures(seen),
         matched_figures.shape_figure(groups),
         matched_figures.scattering_figure(groups),
         matched_figures.displacement_figure(groups),
@@ -196,6 +271,7 @@ def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
             f"{(scene.save_every or 1) * TIME:g} min, and measured by the same program as the "
             "recording. What it should have found is known exactly.",
         ),
-        tables=(table,),
+        points=_STEP_TEXTS,
+        tables=tables,
         figures=tuple(figure for figure in figures if figure is not None),
     )

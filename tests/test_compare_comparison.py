@@ -1,12 +1,16 @@
 """Comparison: agreement, refusal to compare, pooling over trials, units, equal bytes."""
 
+import html
 import json
 import math
 import re
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,15 +20,18 @@ from cellquant.compare.comparison import (
     AGREE,
     DIFFER,
     NOT_COMPARABLE,
-    Matched,
+    Comparison,
     judge,
-    matched_scalars,
     unit_mapping,
 )
-from cellquant.compare.groups import read_groups
+from cellquant.compare.groups import Group, read_groups
+from cellquant.compare.matching import Matched, matched_scalars
+from cellquant.compare.page import format_value
 from cellquant.compare.results import Result
+from cellquant.compare.study_figures import crowding_figure
 from cellquant.compare.units import STERIC_AREA
 from cellquant.errors import InputError
+from cellquant.pipeline import observe_source
 from compare_examples import make_layer
 
 
@@ -205,6 +212,9 @@ def test_study_against_sweep(study: Path, sweep: Path, tmp_path: Path) -> None:
     assert 'id="map-mean-shape-index"' in page
     assert 'id="relaxation-times"' in page
     assert "8 simulated scenes (16 runs)" in page
+    assert f"cellquant compare {shlex.quote(str(study))} {shlex.quote(str(sweep))}" in (
+        html.unescape(page)
+    )
     content = comparison.as_dict()
     assert len(content["pairs"]) == 16
     json.dumps(content, allow_nan=False)
@@ -250,8 +260,68 @@ def test_folder_brings_its_trajectories(movie, model, tmp_path: Path) -> None:
     movie.tracks.write(folder / "tracks.parquet")
     cq.compare(folder, model.result("model")).to_html(tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
-    assert 'data-name="paths-1"' in page
-    assert 'data-name="paths-2"' in page
+    for view in ("whole", "close"):
+        assert f'data-name="paths-{view}-1"' in page
+        assert f'data-name="paths-{view}-2"' in page
+
+
+def test_scene_is_found_in_the_run_behind_a_folder(tmp_path: Path) -> None:
+    scene = cq.Scene(phi=0.8, v0=0.05, eta=0.02, n_cells=9)
+    cq.simulate(scene, duration=4, output=tmp_path / "RUN.zarr")
+    for number in (1, 2):
+        observe_source(tmp_path / "RUN.zarr", tmp_path / f"o{number}", only=["shape_index"])
+    first, second = read_groups([tmp_path / "o1", tmp_path / "o2"])
+    assert dict(first.scene) == {"phi": 0.8, "v0": 0.05, "eta": 0.02}
+    assert (first.name, second.name) == (
+        "φ = 0.8, v₀ = 0.05, η = 0.02", "φ = 0.8, v₀ = 0.05, η = 0.02 (2)",
+    )  # fmt: skip
+    verdicts = cq.compare(tmp_path / "o1", tmp_path / "o2").verdicts(first, second)
+    assert all(v.verdict != DIFFER for v in verdicts)
+
+
+def test_samples_and_units_stand_beside_the_numbers(study: Path, model, tmp_path: Path) -> None:
+    comparison = cq.compare(study, model.result("model"))
+    comparison.to_html(tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    text = html.unescape(re.sub("<.*?>", "", page))
+    assert "3 trials" in text
+    assert "1 run" in text
+    tau = comparison.groups[0].scalars()["tau_alpha.value"]
+    assert f"{format_value(tau.value, tau.std_error)} min" in text
+
+
+def crowded(layer, bins: dict[float, float]):
+    """A result with F_s = exp(-t/tau) in the windows of each density bin."""
+    lag = np.arange(1.0, 200.0, 2.0)
+    rows = [
+        pd.DataFrame({"lag_time": lag, "value": np.exp(-lag / tau), "std_error": 0.01,
+                      "n_pairs": 9, "scope": "window", "bin_centre": centre})
+        for centre, tau in bins.items()
+    ]  # fmt: skip
+    result = layer.result("movie")
+    tables = {**result.tables, "self_intermediate_scattering": pd.concat(rows)}
+    return replace(result, tables=tables)
+
+
+def test_scattering_against_crowding(movie, sweep: Path) -> None:
+    trials = {
+        "a": (crowded(movie, {1100.0: 40.0, 1600.0: 80.0}),),
+        "b": (crowded(movie, {1100.0: 44.0}),),
+    }
+    group = Group("untreated", False, trials, {})
+    figure = crowding_figure(Comparison((group, *read_groups([sweep]))))
+    assert figure is not None
+    assert [panel.title.split(":")[0] for panel in figure.panels] == ["Experiment", "Simulation"]
+    assert figure.data is not None
+    named = figure.data.groupby("result")["std_error"].first()
+    assert any("1100 (n = 2)" in name for name in named.index)
+    assert any("1600 (n = 1)" in name for name in named.index)
+    # In units of the relaxation time at 1100: there the mean curve crosses 1/e at one.
+    curve = figure.data[figure.data["result"].str.contains("1100")]
+    crossing = np.interp(-np.exp(-1), -curve["value"], curve["lag_over_tau_alpha"])
+    assert crossing == pytest.approx(1.0, abs=1e-3)
+    assert crowding_figure(Comparison((Group("one bin", False, {
+        "b": (crowded(movie, {1100.0: 44.0}),)}, {}),))) is None  # fmt: skip
 
 
 def test_what_is_refused(movie, tmp_path: Path) -> None:

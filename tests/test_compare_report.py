@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import io
+import math
 import re
 from pathlib import Path
 from urllib.parse import unquote
@@ -164,8 +165,12 @@ def test_any_text_is_safe_on_the_page(text: str) -> None:
         (40.0, 2.4, "40.0 ± 2.4"),
         (1234.5, 96.0, "1234 ± 96"),
         (12345.6, 996.0, "12\N{NARROW NO-BREAK SPACE}300 ± 1000"),
-        (-0.5, None, "−0.5000"),
-        (0.0, 0.0, "0.000"),
+        (-0.5, None, "−0.5"),
+        (0.0, 0.0, "0"),
+        (17.0, None, "17"),
+        (0.25, math.nan, "0.25"),
+        (1000.0, None, "1000"),
+        (-0.004, 0.16, "0.00 ± 0.16"),
         (1.5e-9, None, "1.50 × 10^{−9}"),
         (float("nan"), 1.0, "–"),
         (None, None, "–"),
@@ -201,6 +206,22 @@ def test_commands_repeat_what_was_recorded() -> None:
         "--max-distance 12.0 --no-divisions"
     ]
     assert command_lines({"command": "unheard-of"}) == []
+    observed = {
+        "command": "observe",
+        "settings": {"source": "RUN.zarr", "only": ["msd", "speed"], "smoothing": 1,
+                     "drift": False, "stride": 1, "lags": [1, 2], "core_range": [0.0, 0.3]},
+    }  # fmt: skip
+    assert command_lines(observed) == [
+        "cellquant observe RUN.zarr -o RESULTS --only msd --only speed --smoothing 1 --no-drift "
+        "--lags 1,2 --core-range 0 0.3"
+    ]
+    # A stack or scene is made by the file of the whole.
+    assert command_lines({"command": "sweep", "settings": {"phi": 0.9}}) == [
+        "cellquant sweep SWEEP.toml -o RESULTS"
+    ]
+    assert command_lines({"command": "run", "inputs": {"a.tif": "", "e.toml": ""}}) == [
+        "cellquant run e.toml -o RESULTS"
+    ]
 
 
 def test_result_is_read_back_from_its_folder(layer: Layer, tmp_path: Path) -> None:

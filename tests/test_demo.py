@@ -9,7 +9,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cellquant.closed_loop import QUANTITIES, STAGES, STEPS, close_loop, closed_loop_table
+from cellquant.closed_loop import (
+    QUANTITIES,
+    SMOOTHED,
+    STAGES,
+    STEPS,
+    close_loop,
+    closed_loop_table,
+)
 from cellquant.demo import demo_scene, run_demo
 
 
@@ -51,10 +58,10 @@ def numbers_in(content: object) -> list[float]:
 def test_every_number_of_the_tables_stands_in_a_file_beside_the_page(demo: Path) -> None:
     page = (demo / "report.html").read_text(encoding="utf-8")
     tables = re.findall(r"<table.*?</table>", page, flags=re.DOTALL)
-    assert len(tables) >= 2
+    assert len(tables) == 3
     checked = 0
     for table, source in zip(
-        tables, ("layer/closed_loop.json", "recording/summary.json"), strict=False
+        tables, ("layer/closed_loop.json",) * 2 + ("recording/summary.json",), strict=True
     ):
         known = np.array(numbers_in(json.loads((demo / source).read_text())))
         # Shares are shown in per cent, densities per million square pixels.
@@ -89,6 +96,12 @@ def check_loop(table: pd.DataFrame) -> None:
     shares = np.prod(1 + table[steps].to_numpy(), axis=1) - 1
     assert shares == pytest.approx(table["error"].to_numpy(), abs=1e-12)
     assert (table["from_linking"].abs() < 1e-3).all()
+    # Smoothing changes motion by more than the loop is off, but by the same on both sides.
+    for name, least in (("relaxation time", 0.02), ("MSD at the relaxation time", -1.0)):
+        assert table.loc[name, "smoothing_adds"] > least, name
+        assert abs(table.loc[name, "error_smoothed"]) < 1.2 * LIMITS[name], name
+    shapes = ["mean shape index", "mean diameter", "van Hove core σ²", "van Hove tail ξ"]
+    assert (table.loc[shapes, "smoothing_adds"] == 0).all()
 
 
 def test_the_closed_loop_recovers_the_truth(demo: Path) -> None:
@@ -99,7 +112,9 @@ def test_the_closed_loop_recovers_the_truth(demo: Path) -> None:
 def test_the_table_splits_the_error() -> None:
     stages = {
         stage: {quantity.label: (value, 0.1) for quantity in QUANTITIES}
-        for stage, value in zip(STAGES, (1.0, 2.0, 3.0, 6.0, 3.0), strict=True)
+        for stage, value in zip(
+            [*STAGES, *SMOOTHED], (1.0, 2.0, 3.0, 6.0, 3.0, 4.0, 2.0), strict=True
+        )
     }
     stages["found"]["relaxation time"] = (float("nan"), float("nan"))
     table = closed_loop_table(stages).set_index("quantity")
@@ -108,6 +123,7 @@ def test_the_table_splits_the_error() -> None:
     assert row[[f"from_{step.replace(' ', '_')}" for step in STEPS.values()]].tolist() == [
         1.0, 0.5, 1.0, -0.5,
     ]  # fmt: skip
+    assert row[["smoothing_adds", "error_smoothed"]].tolist() == [2 / 3 - 1, -0.5]
     # The speed is the displacement over one frame interval: sampling cannot change it.
     assert table.loc["mean speed", ["truth", "from_frame_interval", "error"]].tolist() == [
         2,

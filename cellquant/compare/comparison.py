@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cellquant import __version__
 from cellquant.compare.groups import Group, read_groups
-from cellquant.compare.results import Scalar, look_up
-from cellquant.compare.units import STERIC_AREA, packing_fraction_of
+from cellquant.compare.matching import Matched, matched_scalars, product_of
+from cellquant.compare.results import Scalar
+from cellquant.compare.units import STERIC_AREA
 from cellquant.errors import InputError
 from cellquant.storage import write_json
 
@@ -23,35 +24,6 @@ NOT_COMPARABLE = "not comparable"
 LEVEL = 2.0  # combined standard errors up to which two values are said to agree
 
 MAX_INTERVAL_RATIO = 1.5  # of the frame intervals of two speeds that may be compared
-
-
-@dataclass(frozen=True)
-class Matched:
-    """A number that means the same on both sides, free of units.
-
-    Attributes
-    ----------
-    key, label
-        Its name.
-    value, std_error
-        NaN where not known.
-    reason
-        Why it must not be compared, or why it is not known; empty where it may be.
-    rule
-        How it follows from what was measured.
-    interval, smoothing
-        Time between frames over tau_alpha, and points of the moving average, for numbers that
-        depend on them; NaN otherwise.
-    """
-
-    key: str
-    label: str
-    value: float
-    std_error: float
-    rule: str
-    reason: str = ""
-    interval: float = math.nan
-    smoothing: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -114,11 +86,14 @@ class Comparison:
         Steric cell area and its standard error, um^2, behind the effective packing fraction.
     fits
         Which scenes and parameters match each experiment, where that was asked for.
+    settings
+        How it was made: sources as given, and options.
     """
 
     groups: tuple[Group, ...]
     area: tuple[float, float] = STERIC_AREA
     fits: "tuple[Fit, ...]" = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def experiments(self) -> tuple[Group, ...]:
@@ -148,6 +123,7 @@ class Comparison:
         return {
             "program": "cellquant",
             "version": __version__,
+            "settings": dict(self.settings),
             "level": LEVEL,
             "steric_area": {"value": self.area[0], "std_error": self.area[1], "unit": "um^2"},
             "groups": [_group_dict(group, self.area) for group in self.groups],
@@ -221,7 +197,16 @@ def compare(
         )
     if not (steric_area[0] > 0 and steric_area[1] >= 0):
         raise InputError(f"steric_area must be > 0 um^2 with an error >= 0, got {steric_area}.")
-    comparison = Comparison(tuple(groups), steric_area)
+    named = [str(s) if isinstance(s, str | Path) else "in memory" for s in sources]
+    settings: dict[str, Any] = {
+        "sources": named,
+        "steric_area": list(steric_area),
+        "fit": fit,
+    }
+    if fit:
+        settings |= {"seed": seed, "L0": units and list(units.length),
+                     "t0": units and list(units.time)}  # fmt: skip
+    comparison = Comparison(tuple(groups), steric_area, settings=settings)
     if not fit:
         return comparison
     from cellquant.compare.fit import fit_groups
@@ -255,118 +240,6 @@ def judge(first: Matched, second: Matched) -> Verdict:
     return Verdict(first.key, first.label, (first, second), difference, error, verdict, reason)
 
 
-_DIRECT = (
-    "shape_index.mean", "shape_index.median", "shape_index.mode", "shape_index.std",
-    "shape_index.skewness", "van_hove.sigma2", "van_hove.xi", "msd.exponent", "alpha2_peak.value",
-)  # fmt: skip
-
-
-def matched_scalars(group: Group, *, area: tuple[float, float]) -> dict[str, Matched]:
-    """The numbers of a group that carry no unit, or whose unit both sides share.
-
-    Lengths are divided by the mean cell diameter d, times by tau_alpha, and the density of a
-    movie becomes an effective packing fraction.
-    """
-    scalars = group.scalars()
-    found = {
-        key: Matched(key, scalars[key].label, scalars[key].value, scalars[key].std_error,
-                     "as measured", _unknown(scalars[key]))
-        for key in _DIRECT
-        if key in scalars
-    }  # fmt: skip
-    found["packing_fraction"] = _packing(group, scalars, area)
-    found |= _ratios(group, scalars)
-    if "chi4_peak.value" in scalars:
-        chi4 = scalars["chi4_peak.value"]
-        reason = "χ_{4} grows with the number of cells in view, which differs between the sides"
-        found["chi4_peak.value"] = Matched(
-            chi4.key, chi4.label, chi4.value, chi4.std_error, "as measured", reason
-        )
-    for key, label, role in (
-        ("tau_alpha.value", "Relaxation time τ_{α}", "time"),
-        ("wave_number.mean_diameter", "Mean cell diameter d", "length"),
-    ):
-        if key in scalars:
-            scalar = scalars[key]
-            unit = scalar.unit
-            found[key] = Matched(
-                key, label, scalar.value, scalar.std_error, f"in {unit}",
-                _unknown(scalar) or f"it sets the unit of {role} in which the sides are compared",
-            )  # fmt: skip
-    return found
-
-
-def _unknown(scalar: Scalar) -> str:
-    if math.isfinite(scalar.value):
-        return ""
-    return f"only a bound is known, > {scalar.censored_at:g} {scalar.unit}"
-
-
-def _packing(group: Group, scalars: Mapping[str, Scalar], area: tuple[float, float]) -> Matched:
-    key, label = "packing_fraction", "Packing fraction φ, effective for movies"
-    density = scalars.get("density.mean")
-    if group.simulated:
-        if "phi" in group.scene:
-            return Matched(key, label, group.scene["phi"], 0.0, "φ of the scene")
-        return Matched(key, label, math.nan, math.nan, "", "φ of the scene is not recorded")
-    if density is None or density.unit != "1/mm^{2}":
-        return Matched(key, label, math.nan, math.nan, "", "the movie has no density in 1/mm^{2}")
-    error = density.std_error if math.isfinite(density.std_error) else 0.0
-    value, spread = packing_fraction_of(density.value, error, area=area)
-    rule = f"density × steric cell area of {area[0]:.0f} ± {area[1]:.0f} µm^{{2}}"
-    reason = (
-        "no one-to-one map leads from a density to a packing fraction; the effective value "
-        "orders the two sides"
-    )
-    return Matched(key, label, value, spread, rule, reason)
-
-
-def _ratios(group: Group, scalars: Mapping[str, Scalar]) -> dict[str, Matched]:
-    found = {}
-    d, tau = scalars.get("wave_number.mean_diameter"), scalars.get("tau_alpha.value")
-    speed, lag = scalars.get("speed.mean"), scalars.get("alpha2_peak.lag_time")
-    peak = scalars.get("wave_number.q_peak")
-    if d is not None and peak is not None and math.isfinite(peak.value):
-        found["q_peak"] = _product(
-            "q_peak", "First peak of S(q), q_{peak} d/2π", [(peak, 1), (d, 1)], 1 / (2 * math.pi)
-        )
-    if tau is None or not math.isfinite(tau.value):
-        return found
-    if lag is not None:
-        found["alpha2_lag"] = _product(
-            "alpha2_lag", "Lag of the peak of α_{2}, in τ_{α}", [(lag, 1), (tau, -1)]
-        )
-    if speed is not None and d is not None:
-        product = _product("speed", "Mean speed, in d/τ_{α}", [(speed, 1), (tau, 1), (d, -1)])
-        points = look_up(group.members[0].summary, "processing.smoothing_points")
-        found["speed"] = replace(
-            product,
-            interval=_frame_interval(group) / tau.value,
-            smoothing=math.nan if points is None else float(points),
-        )
-    return found
-
-
-def _frame_interval(group: Group) -> float:
-    speed = group.members[0].summary.get("speed", {})
-    value = speed.get("dt") if isinstance(speed, Mapping) else None
-    return float(value) if value is not None else math.nan
-
-
-def _product(
-    key: str,
-    label: str,
-    terms: Sequence[tuple[Scalar, int]],
-    factor: float = 1.0,
-) -> Matched:
-    value, squares = factor, 0.0
-    for scalar, power in terms:
-        value *= scalar.value**power
-        squares += (power * scalar.std_error / scalar.value) ** 2
-    error = abs(value) * math.sqrt(squares)
-    return Matched(key, label, value, error, "ratio of measured values")
-
-
 def unit_mapping(movie: Group, model: Group) -> UnitMapping | None:
     """L0 and t0 in the movie's units, so that cell diameters and relaxation times coincide.
 
@@ -392,7 +265,7 @@ def _ratio(top: Scalar | None, bottom: Scalar | None) -> tuple[float, float] | N
         return None
     if not (math.isfinite(top.value) and bottom.value > 0):
         return None
-    product = _product("", "", [(top, 1), (bottom, -1)])
+    product = product_of("", "", [(top, 1), (bottom, -1)])
     return product.value, product.std_error
 
 

@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 
 from cellquant.compare.figures import Curve
-from cellquant.compare.results import Result, Scalar, curve_of, read_result, read_scalars
+from cellquant.compare.results import (
+    Result,
+    Scalar,
+    curve_of,
+    read_result,
+    read_scalars,
+)
+from cellquant.compare.sources import run_of
 from cellquant.errors import InputError
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
@@ -185,11 +192,14 @@ def scene_of(result: Result) -> dict[str, float]:
     """phi, v0 and eta of a simulated result, as far as its record or its run tells."""
     if not result.simulated:
         return {}
-    found = {}
+    found: dict[str, float] = {}
+    run = (
+        None if all(_find(result.record, key) is not None for key in SCENE_KEYS) else run_of(result)
+    )
     for key in SCENE_KEYS:
         value = _find(result.record, key)
-        if value is None and result.run is not None:
-            value = getattr(result.run.scene, key, None)
+        if value is None and run is not None:
+            value = getattr(run.scene, key, None)
         if value is None and result.tracks is not None:
             value = _find(result.tracks.provenance, key)
         if isinstance(value, int | float):

@@ -18,14 +18,15 @@ from cellquant.compare.figures import (
 from cellquant.compare.groups import Group
 from cellquant.compare.page import Figure, Panel
 from cellquant.compare.panels import join_curves, shape_limits
-from cellquant.compare.results import with_sources
+from cellquant.compare.sources import with_sources
 
 if TYPE_CHECKING:
-    pass
+    import pandas as pd
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 MAX_CURVES = 6
 MAX_PICTURES = 3
+SQUARE = 8.0  # mean diameters, edge of the enlarged part of the trajectories
 Measure = Callable[[Group, int], list[Curve]]
 
 
@@ -121,7 +122,9 @@ def hove_figure(groups: Sequence[Group]) -> Figure | None:
         name="van-hove",
         title="Displacements after one relaxation time: van Hove function",
         caption="Probability per area of a displacement r at t = τ_{α}, r in units of d. Dashed: "
-        "Gaussian fit of the core; full line: exponential fit of the tail (of the first trial).",
+        "Gaussian fit of the core, exp(−r^{2}/σ^{2}) with σ^{2} the mean square displacement of "
+        "the core; full line: exponential fit of the tail, exp(−r/ξ). Fits are those of the first "
+        "trial; bars are standard errors.",
         alt="Van Hove functions with Gaussian core and exponential tail",
         x=Scale("r/d", limits=(0.0, max(float(np.nanmax(c.x)) for c in every))),
         y=Scale("G_{s}(r, τ_{α}) d^{2}", log=True,
@@ -167,51 +170,73 @@ def layer_figure(groups: Sequence[Group]) -> Figure | None:
     )
 
 
-def paths_figure(groups: Sequence[Group]) -> Figure | None:
-    """Trajectories in windows of the same size in cell diameters."""
+def path_figures(groups: Sequence[Group]) -> list[Figure]:
+    """Trajectories of the whole layer, and a window of the same size in cell diameters."""
     import pandas as pd
 
     from cellquant.compare.pictures import draw_paths, thin_paths
     from cellquant.tables import Units
 
-    panels, parts = [], []
+    views: dict[str, list[Panel]] = {"whole": [], "close": []}
+    data: dict[str, list[pd.DataFrame]] = {"whole": [], "close": []}
     for index, group in enumerate(with_pictures(groups)):
         tracks = group.members[0].tracks
         d = group.scalars().get("wave_number.mean_diameter")
-        tau = group.scalars().get("tau_alpha.value")
         if tracks is None or d is None or tracks.table.empty:
             continue
         table = tracks.table[["track_id", "frame", "x", "y"]].copy()
         table[["x", "y"]] /= d.value
-        shown = "the whole recording"
-        if tau is not None and math.isfinite(tau.value):
-            last = table["frame"].max()
-            span = max(2, round(2 * tau.value / tracks.frame_interval))
-            table = table[table["frame"] > last - span]
-            shown = "the last two τ_{α}"
-        middle = table[["x", "y"]].median().to_numpy()
-        window = (middle[0] - 5, middle[0] + 5, middle[1] - 5, middle[1] + 5)
-        inside = table["x"].between(*window[:2]) & table["y"].between(*window[2:])
-        near = table[table["track_id"].isin(table.loc[inside, "track_id"].unique())]
-        paths = thin_paths(near, max_points=5000)
-        if paths.empty:
-            continue
-        name = f"paths-{index + 1}"
-        svg = draw_paths(paths, name, units=Units("d", tracks.units.time), window=window)
-        words = f"Paths of cells of {group.name} over {shown.replace('_{α}', ' alpha')}."
-        panels.append(Panel(name, svg, words, group.name))
-        parts.append(paths.assign(result=group.name))
-    if not panels:
-        return None
-    return Figure(
-        name="paths",
-        title="Trajectories, at the same scale",
-        caption="A square of ten by ten cell diameters, over two relaxation times where they are "
-        "known. Dots mark where the paths end.",
-        panels=tuple(panels),
-        data=pd.concat(parts, ignore_index=True),
-        wide=True,
-    )
+        recent, span = _recent(table, group, tracks.frame_interval)
+        low, high = table[["x", "y"]].min().to_numpy(), table[["x", "y"]].max().to_numpy()
+        middle = 0.5 * (low + high)
+        square = (middle[0] - SQUARE / 2, middle[0] + SQUARE / 2,
+                  middle[1] - SQUARE / 2, middle[1] + SQUARE / 2)  # fmt: skip
+        inside = recent["x"].between(*square[:2]) & recent["y"].between(*square[2:])
+        near = recent[recent["track_id"].isin(recent.loc[inside, "track_id"].unique())]
+        units = Units("d", tracks.units.time)
+        for view, chosen, window in (
+            ("whole", recent, (low[0], high[0], low[1], high[1])),
+            ("close", near, square),
+        ):
+            paths = thin_paths(chosen, max_points=5000)
+            if paths.empty:
+                continue
+            name = f"paths-{view}-{index + 1}"
+            svg = draw_paths(paths, name, units=units, window=window,
+                             frame=square if view == "whole" else None)  # fmt: skip
+            shown = "in the marked square" if view == "close" else "in view"
+            words = f"Paths of the cells of {group.name} {shown}, over {span}."
+            views[view].append(Panel(name, svg, words, group.name))
+            data[view].append(paths.assign(result=group.name))
+    captions = {
+        "whole": (
+            "Trajectories",
+            "The last two relaxation times, or the whole recording where τ_{α} is not known or the "
+            "recording is shorter. Dots mark where the paths end; lengths are in mean cell "
+            "diameters d. The marked square is enlarged below.",
+        ),
+        "close": (
+            "Trajectories, enlarged to the same scale",
+            f"A square of {SQUARE:g} by {SQUARE:g} cell diameters on every side, so that paths can "
+            "be compared by eye.",
+        ),
+    }
+    return [
+        Figure(f"paths-{view}", *captions[view], tuple(panels),
+               pd.concat(data[view], ignore_index=True), wide=True)
+        for view, panels in views.items() if panels
+    ]  # fmt: skip
+
+
+def _recent(
+    table: "pd.DataFrame", group: Group, frame_interval: float
+) -> "tuple[pd.DataFrame, str]":
+    """The part of the trajectories that lies in the last two relaxation times."""
+    tau = group.scalars().get("tau_alpha.value")
+    if tau is None or not math.isfinite(tau.value):
+        return table, "the whole recording"
+    span = max(2, round(2 * tau.value / frame_interval))
+    return table[table["frame"] > table["frame"].max() - span], "the last two relaxation times"
 
 
 def add_sources(groups: Sequence[Group]) -> list[Group]:

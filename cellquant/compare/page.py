@@ -145,13 +145,14 @@ def write_page(page: Page, path: str | Path) -> None:
 def format_value(value: float | None, std_error: float | None = None) -> str:
     """A number with its standard error, both to two digits of the error: ``3.912 ± 0.013``.
 
-    Without an error the number keeps four significant digits; without a number it is a dash.
+    Without an error the number keeps four significant digits at most; without a number it is a
+    dash.
     """
     if value is None or not math.isfinite(value):
         return "\N{EN DASH}"
     # An error at the level of round-off is none: every part of the sample gave the same number.
     if std_error is None or not math.isfinite(std_error) or std_error <= 1e-12 * abs(value):
-        return _plain(value, 3 - _magnitude(value))
+        return _without_zeros(_plain(value, 3 - _magnitude(value)))
     digits = 1 - _magnitude(float(f"{std_error:.1e}"))
     return f"{_plain(value, digits)} ± {_plain(std_error, digits)}"
 
@@ -165,12 +166,17 @@ def _plain(value: float, digits: int) -> str:
         mantissa, exponent = f"{value:.2e}".split("e")
         power = str(int(exponent)).replace("-", MINUS)
         return f"{mantissa} × 10^{{{power}}}".replace("-", MINUS)
-    rounded = round(value, digits)
+    rounded = round(value, digits) + 0.0  # no minus before a zero
     text = f"{rounded:.{max(digits, 0)}f}"
     whole, dot, rest = text.partition(".")
     if len(whole.lstrip("-")) > 4:
         whole = f"{int(whole):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
     return (whole + dot + rest).replace("-", MINUS)
+
+
+def _without_zeros(text: str) -> str:
+    """Drop zeros after the point, where no error says how many digits count."""
+    return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
 
 
 def flatten(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

@@ -337,16 +337,47 @@ def command_lines(record: Mapping[str, Any]) -> list[str]:
         return [shlex.join(words)]
     if command == "observe":
         words = ["cellquant", "observe", str(settings.get("source", "RESULTS")), "-o", "RESULTS"]
-        for name in settings.get("only") or ():
-            words += ["--only", str(name)]
-        return [shlex.join(words)]
-    if command in {"run", "simulate", "sweep", "demo"}:
-        words = ["cellquant", str(command)]
-        words += inputs[:1] if command in {"run", "sweep"} else []
-        if command == "demo":
-            words += ["--seed", str(settings.get("seed", 1))]
-        return [shlex.join([*words, "-o", "RESULTS"])]
+        return [shlex.join([*words, *_observe_options(settings)])]
+    if command in {"run", "sweep"}:
+        # A stack or a scene is made by the file of the whole.
+        given = [name for name in inputs if name.endswith(".toml")]
+        file = given[0] if given else {"run": "EXPERIMENT.toml", "sweep": "SWEEP.toml"}[command]
+        return [shlex.join(["cellquant", command, file, "-o", "RESULTS"])]
+    if command == "demo":
+        return [f"cellquant demo --seed {settings.get('seed', 1)} -o RESULTS"]
+    if command == "simulate":
+        return [shlex.join(["cellquant", "simulate", *inputs[:1], "-o", "RUN.zarr"])]
     return []
+
+
+_OBSERVE_DEFAULTS = {
+    "drift": True,
+    "keep_cut_cells": False,
+    "wave_number": "2pi/d",
+    "scattering": "bessel",
+    "stride": 1,
+    "max_frames": 32,
+}
+
+
+def _observe_options(settings: Mapping[str, Any]) -> list[str]:
+    """Options of observe that were set to something else than the default."""
+    words: list[str] = []
+    for name, value in settings.items():
+        if value is None or name in {"source", "stage"} or value == _OBSERVE_DEFAULTS.get(name):
+            continue
+        option = f"--{name.replace('_', '-')}"
+        if name == "only":
+            words += [word for item in value for word in (option, str(item))]
+        elif isinstance(value, bool):
+            words.append(option if value else f"--no-{option[2:]}")
+        elif name in {"core_range", "tail_range"}:
+            words += [option, *(f"{v:g}" for v in value)]
+        elif isinstance(value, list | tuple):
+            words += [option, ",".join(f"{v:g}" for v in value)]
+        else:
+            words += [option, str(value)]
+    return words
 
 
 def _versions() -> tuple[tuple[str, str], ...]:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from cellquant.compare.figures import Curve
 from cellquant.errors import InputError
-from cellquant.tables import Units, read_table, read_tracks
+from cellquant.tables import Units, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -97,9 +97,11 @@ _CATALOGUE = (
     _Entry("speed.median", "Median speed", (1, -1), "of the same displacements",
            "speed.median_std_error"),
     _Entry("van_hove.sigma2", "Core of G_{s}: σ^{2}/d^{2}", (0, 0),
-           "Gaussian fit of the van Hove function at t = τ_{α}", "van_hove.sigma2_std_error"),
+           "core of the van Hove function at t = τ_{α} fitted by exp(−r^{2}/σ^{2}), σ^{2} being "
+           "its mean square displacement", "van_hove.sigma2_std_error"),
     _Entry("van_hove.xi", "Tail of G_{s}: ξ/d", (0, 0),
-           "exponential fit of the van Hove function at t = τ_{α}", "van_hove.xi_std_error"),
+           "tail of the van Hove function at t = τ_{α} fitted by exp(−r/ξ)",
+           "van_hove.xi_std_error"),
     _Entry("msd.exponent", "Exponent of the MSD", (0, 0), "slope in the logarithms at long lags",
            "msd.exponent_std_error"),
     _Entry("msd.diffusion_coefficient", "Diffusion coefficient D", (2, -1),
@@ -203,62 +205,6 @@ def read_result(source: "str | Path | Observables | Result", *, name: str = "") 
     return Result(name or folder.resolve().name, summary, tables, record, folder)
 
 
-def with_sources(result: Result) -> Result:
-    """Add the trajectories, masks or run that a result was made from, where they are at hand.
-
-    They are looked for in the result's folder and at the paths that its record names; what is
-    gone or cannot be read stays None.
-    """
-    if result.folder is None:
-        return result
-    records = [result.record, *result.record.get("earlier", [])]
-    places = [result.folder]
-    for record in records:
-        source = record.get("settings", {}).get("source")
-        if isinstance(source, str):
-            places += [Path(source), result.folder / source]
-    found = result
-    for place in places:
-        try:
-            if found.tracks is None and (place / "tracks.parquet").is_file():
-                found = replace(found, tracks=read_tracks(place))
-            for zarr in (place, place / "run.zarr"):
-                if found.run is None and (zarr / "zarr.json").is_file():
-                    from cellquant.sim import open_run
-
-                    run = open_run(zarr)
-                    found = replace(found, run=run, tracks=run.to_tracks())
-        except (InputError, OSError):
-            continue
-    for record in records:
-        if found.stack is None and not found.simulated:
-            found = replace(found, stack=_masks_of(record, result.folder))
-    return found
-
-
-def _masks_of(record: Mapping[str, Any], folder: Path) -> "LabelStack | None":
-    from cellquant.io import read_labels
-
-    settings = record.get("settings", {})
-    named = [settings.get("masks"), *record.get("inputs", {})]
-    calibration = settings.get("calibration", settings)
-    for path in [Path(name) for name in named if isinstance(name, str)]:
-        for place in (path, folder / path.name):
-            if not place.exists() or place.suffix in {".parquet", ".toml", ".json", ".zarr"}:
-                continue
-            try:
-                if {"px", "pixel"} & {calibration.get("length_unit"), calibration.get("units")}:
-                    return read_labels(place, units="pixel")
-                return read_labels(
-                    place,
-                    pixel_size=calibration.get("pixel_size"),
-                    frame_interval=calibration.get("frame_interval"),
-                )
-            except (InputError, OSError):
-                continue
-    return None
-
-
 def look_up(summary: Mapping[str, Any], key: str) -> Any:
     """Value at a dotted place of a summary; None where there is none."""
     found: Any = summary
@@ -282,15 +228,16 @@ def read_scalars(result: Result) -> list[Scalar]:
             continue
         count = look_up(result.summary, entry.n_key) if entry.n_key else None
         factor, unit = scale_of(entry.power, result.units)
+        error = _number(look_up(result.summary, entry.error_key))
         scalars.append(
             Scalar(
                 key=entry.key,
                 label=entry.label,
                 value=factor * value,
-                std_error=factor * _number(look_up(result.summary, entry.error_key)),
+                std_error=factor * error,
                 unit=unit,
                 n=_sample(entry.key, count, result.summary),
-                rule=_rule(entry, group),
+                rule=_rule(entry, group, known_error=math.isfinite(error)),
                 power=entry.power,
                 censored_at=censored,
             )
@@ -350,7 +297,7 @@ def _sample(key: str, count: Any, summary: Mapping[str, Any]) -> str:
     return f"{retained} tracks" if retained else frames
 
 
-def _rule(entry: _Entry, group: Any) -> str:
+def _rule(entry: _Entry, group: Any, *, known_error: bool) -> str:
     if entry.key == "wave_number.q" and isinstance(group, Mapping):
         rules = {
             "2pi/d": "q = 2π/d",
@@ -360,7 +307,7 @@ def _rule(entry: _Entry, group: Any) -> str:
         return rules.get(str(group.get("rule")), str(group.get("rule")))
     text = entry.rule
     method = group.get("std_error_method") if isinstance(group, Mapping) else None
-    if isinstance(method, str) and entry.error_key:
+    if isinstance(method, str) and known_error:
         text += f"; error: {method}"
     note = group.get("note") if isinstance(group, Mapping) else None
     return f"{text}; {note}" if isinstance(note, str) else text

@@ -9,6 +9,7 @@ import numpy as np
 
 from cellquant.compare.figures import (
     Curve,
+    Mark,
     Scale,
     common_limits,
     count_legend_rows,
@@ -18,12 +19,14 @@ from cellquant.compare.figures import (
 )
 from cellquant.compare.groups import Group
 from cellquant.compare.page import Figure, Panel
+from cellquant.compare.panels import join_curves
 from cellquant.compare.results import look_up, pretty_unit
 
 if TYPE_CHECKING:
     from cellquant.compare.comparison import Comparison
 
 MAX_CURVES = 6
+MAX_BOXES = 12
 
 
 def relaxation_figure(comparison: "Comparison") -> Figure | None:
@@ -92,6 +95,115 @@ def relaxation_figure(comparison: "Comparison") -> Figure | None:
     )
 
 
+def crowding_figure(comparison: "Comparison") -> Figure | None:
+    """F_s in the density bins of a movie, beside F_s at the packing fractions of a sweep."""
+    sides = [
+        side
+        for side in (_by_density(comparison.experiments), _by_packing(comparison.simulations))
+        if side is not None
+    ]
+    if not sides:
+        return None
+    every = [curve for _, curves in sides for curve in curves]
+    x = Scale("t/τ_{α} at the lowest crowding", log=True,
+              limits=common_limits([c.x for c in every], log=True))  # fmt: skip
+    y = Scale("F_{s}(q, t)", limits=(min(-0.08, *(float(np.nanmin(c.y)) for c in every)), 1.08))
+    legend = max(count_legend_rows(curves) for _, curves in sides)
+    panels = []
+    for index, (title, curves) in enumerate(sides):
+        name = f"scattering-crowding-{index + 1}"
+        svg = draw_curves(curves, name, x=x, y=y, legend_rows=legend,
+                          marks=(Mark(math.exp(-1), "1/e", axis="y"),))  # fmt: skip
+        panels.append(Panel(name, svg, f"F_s against time at several degrees of crowding; {title}.",
+                            title))  # fmt: skip
+    return Figure(
+        name="scattering-crowding",
+        title="Memory of places as the layer fills",
+        caption="At q = 2π/d. Movies: analysis windows of each density bin (cells/mm^{2}), the "
+        "mean over n trials. Simulations: scenes that differ in φ alone, the mean over n runs. "
+        "Each side in units of its own τ_{α} where it is least crowded; bands are standard errors.",
+        panels=tuple(panels),
+        data=join_curves({f"{t}: {c.label}": c for t, cs in sides for c in cs},
+                         "lag_over_tau_alpha"),
+        wide=True,
+    )  # fmt: skip
+
+
+def _by_density(groups: Sequence[Group]) -> tuple[str, list[Curve]] | None:
+    """F_s of every density bin of the first condition that has two or more."""
+    import pandas as pd
+
+    for group in groups:
+        trials = []
+        for trial, results in group.trials.items():
+            tables = [r.tables.get("self_intermediate_scattering") for r in results]
+            rows = [
+                t for t in tables if t is not None and {"scope", "bin_centre"} <= set(t.columns)
+            ]
+            if rows:
+                every = pd.concat(rows, ignore_index=True)
+                every = every[(every["scope"] == "window") & every["bin_centre"].notna()]
+                means = every.groupby(["bin_centre", "lag_time"])[["value", "std_error"]].mean()
+                trials.append(means.reset_index().assign(trial=trial))
+        if not trials:
+            continue
+        table = pd.concat(trials, ignore_index=True)
+        bins = sorted(table["bin_centre"].unique())
+        if len(bins) < 2:
+            continue
+        curves = []
+        for series, centre in enumerate(bins[:MAX_CURVES]):
+            here = table[table["bin_centre"] == centre]
+            n = here["trial"].nunique()
+            lags = here.groupby("lag_time")
+            error = lags["value"].std() / np.sqrt(lags["value"].size()) if n > 1 else (
+                lags["std_error"].mean()
+            )  # fmt: skip
+            curves.append(
+                Curve(f"{centre:.0f} (n = {n})", np.array(error.index, dtype=np.float64),
+                      lags["value"].mean().to_numpy(), error.to_numpy(), series)
+            )  # fmt: skip
+        unit = _crossing(curves[0])
+        if math.isfinite(unit):
+            scaled = [replace(c, x=c.x / unit) for c in curves]
+            return f"Experiment: {group.name}", scaled
+    return None
+
+
+def _by_packing(groups: Sequence[Group]) -> tuple[str, list[Curve]] | None:
+    """F_s of the scenes that differ in phi alone, for the (v0, eta) with most of them."""
+    series: dict[tuple[float, float], dict[float, Group]] = {}
+    for group in groups:
+        if len(group.scene) == 3:
+            key = group.scene["v0"], group.scene["eta"]
+            series.setdefault(key, {}).setdefault(group.scene["phi"], group)
+    ranked = sorted(series.items(), key=lambda item: -len(item[1]))
+    for (v0, eta), scenes in ranked:
+        if len(scenes) < 2:
+            break
+        curves = []
+        for number, phi in enumerate(sorted(scenes)[:MAX_CURVES]):
+            curve = scenes[phi].curve("self_intermediate_scattering", series=number)
+            if curve is not None:
+                curves.append(replace(curve, label=f"φ = {phi:g} (n = {scenes[phi].n})"))
+        unit = _crossing(curves[0]) if curves else math.nan
+        if len(curves) > 1 and math.isfinite(unit):
+            scaled = [replace(c, x=c.x / unit) for c in curves]
+            return f"Simulation: v₀ = {v0:g}, η = {eta:g}", scaled
+    return None
+
+
+def _crossing(curve: Curve) -> float:
+    """Lag at which a curve first falls to 1/e, by linear interpolation; NaN where it does not."""
+    level = math.exp(-1)
+    below = np.flatnonzero(curve.y <= level)
+    if below.size == 0 or below[0] == 0:
+        return math.nan
+    i = int(below[0])
+    (x0, x1), (y0, y1) = curve.x[i - 1 : i + 1], curve.y[i - 1 : i + 1]
+    return float(x0 + (y0 - level) / (y0 - y1) * (x1 - x0))
+
+
 def boxes_figure(groups: Sequence[Group], table: str, label: str) -> Figure | None:
     """Quantiles of a distribution, group by group; one drawing per unit."""
     import pandas as pd
@@ -108,15 +220,20 @@ def boxes_figure(groups: Sequence[Group], table: str, label: str) -> Figure | No
         units = group.members[0].units
         unit = f"{pretty_unit(units.length)}/{pretty_unit(units.time)}" if table == "speed" else ""
         five = np.mean(np.array(found, dtype=np.float64), axis=0)
-        by_unit.setdefault(unit, []).append((group.name, series, five.tolist()))
+        name = f"{group.name} (n = {group.n})"
+        by_unit.setdefault(unit, []).append((name, series, five.tolist()))
     if not by_unit or max(len(boxes) for boxes in by_unit.values()) < 2:
         return None
     panels = []
     for index, (unit, boxes) in enumerate(by_unit.items()):
         name = f"{table.replace('_', '-')}-boxes-{index + 1}"
         text = f"{label} ({unit})" if unit else label
-        svg = draw_boxes(boxes[:12], name, label=text)
-        panels.append(Panel(name, svg, f"Quantiles of the {label} of {len(boxes)} groups.", unit))
+        svg = draw_boxes(boxes[:MAX_BOXES], name, label=text)
+        shown = min(len(boxes), MAX_BOXES)
+        title = f"In {unit}" if unit else ""
+        title += f" ({shown} of {len(boxes)} groups)" if shown < len(boxes) else ""
+        words = f"Quantiles of the {label} of {shown} groups."
+        panels.append(Panel(name, svg, words, title.strip()))
     rows = [
         {"result": title, "unit": unit, "q05": q[0], "q25": q[1], "q50": q[2], "q75": q[3],
          "q95": q[4]}
@@ -125,8 +242,8 @@ def boxes_figure(groups: Sequence[Group], table: str, label: str) -> Figure | No
     return Figure(
         name=f"{table.replace('_', '-')}-boxes",
         title=f"{label[0].upper()}{label[1:]}, group by group",
-        caption="Median, middle half and middle nine tenths of all cells; quantiles are means "
-        "over the trials.",
+        caption="Median, middle half and middle nine tenths of all cells. Quantiles are means over "
+        "n trials or runs; their spread is that of cells, not an error.",
         panels=tuple(panels),
         data=pd.DataFrame(rows),
         wide=len(panels) > 1,
