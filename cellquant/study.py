@@ -27,7 +27,8 @@ MAX_CURVES = 6
 def write_study(
     folder: Path, tasks: Sequence[Mapping[str, Any]], record: Mapping[str, Any]
 ) -> None:
-    """Write a study's ``stacks.parquet``, ``relaxation_times.parquet``, statistics and report.
+    """Write a study's ``stacks.parquet``, ``relaxation_times.parquet``, ``trial_values.parquet``,
+    ``statistics.json`` and report.
 
     Parameters
     ----------
@@ -53,7 +54,10 @@ def write_study(
     if times is not None:
         with atomic_path(folder / "relaxation_times.parquet") as path:
             write_table(times, path, units=units)
-        write_json(folder / "statistics.json", study_statistics(times, trial_values(stacks)))
+        trials = trial_values(stacks)
+        with atomic_path(folder / "trial_values.parquet") as path:
+            write_table(trials, path, units=units)
+        write_json(folder / "statistics.json", study_statistics(times, trials))
     _write_report(folder / "report.html", tasks, results, record)
 
 
@@ -177,7 +181,10 @@ def _write_report(
     from cellquant.compare.page import Page, Row, Section, Table, write_page
     from cellquant.compare.report import methods_section, scalar_text, warnings_section
     from cellquant.compare.results import read_scalars
+    from cellquant.compare.study_tables import read_study, statistics_section
 
+    study = read_study(path.parent)
+    compared = () if study is None else (statistics_section(study),)
     scalars = [{scalar.key: scalar for scalar in read_scalars(result)} for result in results]
     shown = [key for key in SCALARS if any(key in found for found in scalars)]
     first = {key: next(found[key] for found in scalars if key in found) for key in shown}
@@ -213,6 +220,7 @@ def _write_report(
             lede=f"{_count(len(names), 'condition')}, {_count(trials, 'independent trial')} and "
             f"{_count(len(tasks), 'stack')}. Each stack has a report of its own beside its tables.",
             sections=(
+                *compared,
                 Section("results", "Results by stack", tables=(table,)),
                 *_curves(path.parent, names, results),
                 warnings_section({}, record, {}, []),

@@ -10,6 +10,7 @@ from cellquant import __version__
 from cellquant.compare.groups import Group, read_groups
 from cellquant.compare.matching import Matched, matched_scalars, product_of
 from cellquant.compare.results import Scalar
+from cellquant.compare.study_tables import Study, read_study
 from cellquant.compare.units import STERIC_AREA
 from cellquant.errors import InputError
 from cellquant.storage import write_json
@@ -88,12 +89,15 @@ class Comparison:
         Which scenes and parameters match each experiment, where that was asked for.
     settings
         How it was made: sources as given, and options.
+    studies
+        Statistics over the conditions of whole experiments.
     """
 
     groups: tuple[Group, ...]
     area: tuple[float, float] = STERIC_AREA
     fits: "tuple[Fit, ...]" = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
+    studies: tuple[Study, ...] = ()
 
     @property
     def experiments(self) -> tuple[Group, ...]:
@@ -206,7 +210,9 @@ def compare(
     if fit:
         settings |= {"seed": seed, "L0": units and list(units.length),
                      "t0": units and list(units.time)}  # fmt: skip
-    comparison = Comparison(tuple(groups), steric_area, settings=settings)
+    found = [read_study(s) for s in sources if isinstance(s, str | Path)]
+    studies = tuple(study for study in found if study is not None)
+    comparison = Comparison(tuple(groups), steric_area, settings=settings, studies=studies)
     if not fit:
         return comparison
     from cellquant.compare.fit import fit_groups

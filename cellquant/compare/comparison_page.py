@@ -45,6 +45,7 @@ from cellquant.compare.study_figures import (
     map_figures,
     relaxation_figure,
 )
+from cellquant.compare.study_tables import statistics_section
 
 
 def build_comparison(comparison: Comparison) -> Page:
@@ -54,6 +55,7 @@ def build_comparison(comparison: Comparison) -> Page:
     sections = [
         verdict_section(pairs),
         sides_section(groups),
+        *(statistics_section(s, number=i) for i, s in enumerate(comparison.studies, start=1)),
         _figures("layers", "The layers", [layer_figure(groups), *path_figures(groups)], _LAYER),
         _figures("shape", "Shape of the cells",
                  [shape_figure(groups), boxes_figure(groups, "shape_index", "shape index p")],
