@@ -192,9 +192,8 @@ def _error_table(loop: Loop) -> "Table":
         caption="Truth and measurement of the same layer, value ± standard error, in units of the "
         "model (L_{0}: diameter of a mean cell; t_{0}: time in which contact forces act; d: mean "
         "diameter as measured). Both show the same cells, so their difference is known better than "
-        "either. Nothing is smoothed. The four columns on the right are the parts of the error, step by "
-        "step as named above. From "
-        "layer/closed_loop.json.",
+        "either. Nothing is smoothed. The four columns on the right are the parts of the error, "
+        "step by step as named above. From layer/closed_loop.json.",
         columns=(
             "Quantity",
             "Truth",

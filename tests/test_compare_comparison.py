@@ -273,7 +273,7 @@ def test_scene_is_found_in_the_run_behind_a_folder(tmp_path: Path) -> None:
     first, second = read_groups([tmp_path / "o1", tmp_path / "o2"])
     assert dict(first.scene) == {"phi": 0.8, "v0": 0.05, "eta": 0.02}
     assert (first.name, second.name) == (
-        "φ = 0.8, v₀ = 0.05, η = 0.02", "φ = 0.8, v₀ = 0.05, η = 0.02 (2)",
+        "φ = 0.8, v₀ = 0.05, η = 0.02", "φ = 0.8, v₀ = 0.05, η = 0.02 (o2)",
     )  # fmt: skip
     verdicts = cq.compare(tmp_path / "o1", tmp_path / "o2").verdicts(first, second)
     assert all(v.verdict != DIFFER for v in verdicts)

@@ -5,7 +5,6 @@ from the others. Where the regions of probability P hold fewer than a share P of
 errors are widened until they do: the regions are calibrated on cases whose truth is known.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ import numpy as np
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 LEVELS = (0.68, 0.95)
+CONFIDENCE = 0.8
 STEP = 1.04
 LARGEST = 4.0
 
@@ -39,9 +39,10 @@ class Forecast(NamedTuple):
 def inflation_for(forecasts: Sequence[Forecast], *, size: int) -> float:
     """Smallest factor on all errors with which the regions hold the scenes often enough.
 
-    Of n scenes, ``ceil((n + 1) P)`` must lie in their region of probability P, for 0.68 and for
-    0.95; all of them where n is too small for that. The rule is that of conformal prediction: a
-    new case that resembles the scenes then lies in its region with a chance of P or more.
+    Of n scenes, k must lie in their region of probability P, for 0.68 and for 0.95: the smallest k
+    with which a new case that resembles the scenes lies in its region with a chance of P or more,
+    with a confidence of 0.8; all of them where n is too small for that. The chance that k of n
+    stand for is distributed as Beta(k, n + 1 - k), whatever made the regions too small.
 
     Parameters
     ----------
@@ -58,10 +59,13 @@ def inflation_for(forecasts: Sequence[Forecast], *, size: int) -> float:
     References
     ----------
     Cook, Gelman & Rubin, J. Comput. Graph. Stat. 15, 675 (2006), doi:10.1198/106186006X136976.
-    Lei et al., J. Am. Stat. Assoc. 113, 1094 (2018), doi:10.1080/01621459.2017.1307116.
+    Vovk, Conditional validity of inductive conformal predictors, Mach. Learn. 92, 349 (2013),
+    doi:10.1007/s10994-013-5355-6, proposition 2a.
     """
+    from scipy.stats import binom
+
     n = len(forecasts)
-    needed = [min(n, math.ceil((n + 1) * level)) for level in LEVELS]
+    needed = [min(n, 1 + int(binom.ppf(CONFIDENCE, n, level))) for level in LEVELS]
     factor = 1.0
     while factor < LARGEST:
         ranks = np.array([smallest_region(f, factor, size=size) for f in forecasts])

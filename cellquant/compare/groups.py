@@ -113,11 +113,17 @@ def read_groups(sources: Sequence[Any], *, names: Sequence[str] | None = None) -
         groups += _groups_of(source, name)
     groups = [*(g for g in groups if not g.simulated), *(g for g in groups if g.simulated)]
     seen: dict[str, int] = {}
-    unique = []
+    unique: list[Group] = []
     for group in groups:
         seen[group.name] = seen.get(group.name, 0) + 1
         again = seen[group.name]
-        unique.append(group if again == 1 else replace(group, name=f"{group.name} ({again})"))
+        folder = group.members[0].folder
+        label = str(again) if folder is None or group.n > 1 else folder.resolve().name
+        name = group.name if again == 1 else f"{group.name} ({label})"
+        while any(other.name == name for other in unique):
+            name = f"{group.name} ({label}, {again})"
+            again += 1
+        unique.append(replace(group, name=name))
     return unique
 
 
