@@ -404,3 +404,21 @@ def test_a_growing_run_is_read_as_a_whole(tmp_path, monkeypatch):
 
     simulate(SMALL, duration=6, dt=0.02, output=path, progress=look)
     assert len(seen) == 1
+
+
+def test_drift_of_the_shape_index_is_stated(tmp_path):
+    run = simulate(Scene(n_cells=16), duration=12, save_every=0.25)
+    found = run.stationarity()
+    assert found.drift > 2 * found.std_error > 0  # shapes still leave the round start
+    assert not found.stationary
+    assert run.stationarity(start=9).drift == pytest.approx(found.drift)  # the last 40 frames
+    series = run.mean_shape_index()
+    assert series == pytest.approx(
+        run.to_tracks().table.groupby("frame")["shape_index"].mean().to_numpy(), rel=1e-12
+    )
+    assert found.drift == pytest.approx(series[29:].mean() - series[9:29].mean(), abs=1e-12)
+    stated = observe(run, only=["shape_index"]).summary["processing"]["stationarity"]
+    assert stated["stationary"] is False
+    assert stated["drift"] == pytest.approx(found.drift, rel=1e-9)
+    with pytest.raises(InputError, match="needs 40 frames"):
+        run.stationarity(start=20)

@@ -4,7 +4,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cellquant import __version__
 from cellquant.errors import InputError
 from cellquant.sim.scene import Scene
-from cellquant.sim.shapes import measure_shapes
+from cellquant.sim.shapes import measure_shapes, shape_indices
 from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
 
 Floats = NDArray[np.float64]
@@ -137,6 +137,19 @@ class Stationarity:
     n_blocks: int
 
 
+def _compare_halves(series: Floats, n_blocks: int) -> Stationarity:
+    length = len(series) // (2 * n_blocks)
+    if length < 4:
+        raise InputError(
+            f"a test of stationarity needs {8 * n_blocks} frames, the run has {len(series)}; "
+            "simulate for longer or save more often."
+        )
+    blocks = series[-2 * n_blocks * length :].reshape(2, n_blocks, length).mean(axis=2)
+    drift = float(blocks[1].mean() - blocks[0].mean())
+    error = float(np.sqrt(np.sum(blocks.var(axis=1, ddof=1)) / n_blocks))
+    return Stationarity(abs(drift) <= 2.0 * error, drift, error, n_blocks)
+
+
 class Run:
     """A simulated run, in memory or on disk, finished or growing.
 
@@ -239,13 +252,7 @@ class Run:
 
     def mean_shape_index(self) -> Floats:
         """(T,) mean over the cells of p = P / sqrt(A), from the true contours."""
-        modes, polarity = self.modes, self.polarity
-        return np.array(
-            [
-                measure_shapes(modes[t], polarity[t], self.radius)["shape_index"].mean()
-                for t in range(self.n_frames)
-            ]
-        )
+        return np.array([shape_indices(modes).mean() for modes in self.modes])
 
     def stationarity(self, n_blocks: int = 5, *, start: int = 0) -> Stationarity:
         """Test whether <p> still drifts: the halves of the run against their block errors.
@@ -265,17 +272,7 @@ class Run:
         InputError
             If the run has fewer than four frames per block.
         """
-        series = self.mean_shape_index()[start:]
-        length = len(series) // (2 * n_blocks)
-        if length < 4:
-            raise InputError(
-                f"a test of stationarity needs {8 * n_blocks} frames, the run has {len(series)}; "
-                "simulate for longer or save more often."
-            )
-        blocks = series[-2 * n_blocks * length :].reshape(2, n_blocks, length).mean(axis=2)
-        drift = float(blocks[1].mean() - blocks[0].mean())
-        error = float(np.sqrt(np.sum(blocks.var(axis=1, ddof=1)) / n_blocks))
-        return Stationarity(abs(drift) <= 2.0 * error, drift, error, n_blocks)
+        return _compare_halves(self.mean_shape_index()[start:], n_blocks)
 
     def to_tracks(self, *, columns: Sequence[str] | None = None) -> Tracks:
         """The run as tracks, measured on the true contours, in reduced units.
@@ -314,6 +311,12 @@ class Run:
             series["x"], series["y"] = position[:, :, 0].T.ravel(), position[:, :, 1].T.ravel()
         if "n_neighbours" in wanted:
             series["n_neighbours"] = self._count_neighbours().T.ravel()
+        provenance: dict[str, Any] = {
+            "source": "simulation",
+            "scene": self.scene.to_dict(),
+            "settings": self.settings,
+            "status": self.status,
+        }
         shapes = [name for name in _SHAPE_COLUMNS if name in wanted]
         if shapes:
             modes, polarity = self.modes, self.polarity
@@ -322,6 +325,12 @@ class Run:
                 table = measure_shapes(modes[t], polarity[t], self.radius)
                 measured[:, :, t] = table[shapes].to_numpy().T
             series.update(zip(shapes, measured.reshape(len(shapes), -1), strict=True))
+            if "shape_index" in shapes:
+                means = measured[shapes.index("shape_index")].mean(axis=0)
+                try:
+                    provenance["stationarity"] = asdict(_compare_halves(means, 5))
+                except InputError as error:
+                    provenance["stationarity"] = {"stationary": None, "reason": str(error)}
         table = pd.DataFrame({name: series[name] for name in wanted}).astype(
             {name: TRACK_COLUMNS[name] for name in wanted}
         )
@@ -331,12 +340,7 @@ class Run:
             frame_interval=float(self.settings["save_every"]),
             area=self.box[0] * self.box[1],
             box=self.box,
-            provenance={
-                "source": "simulation",
-                "scene": self.scene.to_dict(),
-                "settings": self.settings,
-                "status": self.status,
-            },
+            provenance=provenance,
         )
 
     def _count_neighbours(self) -> NDArray[np.int64]:

@@ -55,6 +55,21 @@ def contours(
     return around + position[:, None, :]
 
 
+def shape_indices(modes: Floats) -> Floats:
+    """(...) shape index P / sqrt(A) of contours with modes (..., 2, M - 1), as `measure_shapes`."""
+    n = np.arange(2, modes.shape[-1] + 2)
+    points = 32 * max(6, modes.shape[-1] + 1)
+    angle = 2.0 * math.pi * np.outer(n, np.arange(points)) / points
+    even, odd = np.cos(angle), np.sin(angle)
+    a, b = modes[..., 0, :], modes[..., 1, :]
+    mean = np.sqrt(1.0 - 0.5 * np.sum(modes**2, axis=(-2, -1)))
+    rho = mean[..., None] + a @ even + b @ odd
+    slope = (n * b) @ even - (n * a) @ odd
+    lengths: Floats = np.sqrt(rho * rho + slope * slope).sum(axis=-1)
+    lengths *= 2.0 * math.pi / points / math.sqrt(math.pi)
+    return lengths
+
+
 def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFrame:
     r"""Area, perimeter and axes of every contour by the trapezoid rule, which is spectral here.
 
