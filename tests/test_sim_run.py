@@ -417,7 +417,7 @@ def test_drift_of_the_shape_index_is_stated(tmp_path):
         run.to_tracks().table.groupby("frame")["shape_index"].mean().to_numpy(), rel=1e-12
     )
     assert found.drift == pytest.approx(series[29:].mean() - series[9:29].mean(), abs=1e-12)
-    stated = observe(run, only=["shape_index"]).summary["processing"]["stationarity"]
+    stated = observe(run, only=["shape_index"]).summary["stationarity"]
     assert stated["stationary"] is False
     assert stated["drift"] == pytest.approx(found.drift, rel=1e-9)
     with pytest.raises(InputError, match="needs 40 frames"):

@@ -222,9 +222,9 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
         _CATALOGUE[name].measure(context, out)
     if needs_tracks(wanted):
         out.summary["processing"] = _processing(context)
-        if "shape_index" in out.summary and "stationarity" in context.unsmoothed.provenance:
-            stationarity = context.unsmoothed.provenance["stationarity"]
-            out.summary["processing"]["stationarity"] = stationarity
+    stationarity = source.provenance.get("stationarity") if isinstance(source, Tracks) else None
+    if stationarity is not None and "shape_index" in out.summary:
+        out.summary["stationarity"] = stationarity
     summary: dict[str, Any] = _plain(out.summary)
     statistics = None
     if "relaxation_times" in out.tables:
