@@ -115,15 +115,18 @@ def test_a_planted_trend_is_found() -> None:
     assert "at_bound" not in found
 
 
-def test_censored_points_are_counted_and_enter_at_their_bound() -> None:
+def test_censored_points_are_counted_and_enter_as_bounds() -> None:
     table = study()
     high = table["tau_alpha"] > 42
     table.loc[high, "censored_at"] = 42.0
     table.loc[high, "tau_alpha"] = np.nan
     found = tau_alpha_trend(table)["untreated"]
     assert found["n_censored"] == high.sum()
-    assert found["n"] == (~high).sum()
-    assert found["at_bound"]["slope"] > 0
+    assert found["n"] == len(table)
+    assert "Tobit" in found["method"]
+    assert found["slope"] == pytest.approx(0.01, abs=3 * found["std_error"])
+    assert found["without_bounds"]["n"] == (~high).sum()
+    assert max(found[k]["slope"] for k in ("without_bounds", "at_bound")) < found["slope"]
     means = means_by_bin(table)
     dense = means[means["bin_centre"] == 2600].iloc[0]
     assert dense["n_censored"] > 0

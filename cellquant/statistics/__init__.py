@@ -3,6 +3,7 @@
 The unit of replication is the trial, never the frame or the cell.
 """
 
+from cellquant.statistics.censored import fit_censored_model
 from cellquant.statistics.comparisons import holm, log_rank, mann_whitney, mean_over_trials
 from cellquant.statistics.mixed import MixedModel, fit_mixed_model
 from cellquant.statistics.study import (
@@ -15,6 +16,7 @@ from cellquant.statistics.study import (
 __all__ = [
     "MixedModel",
     "compare_conditions",
+    "fit_censored_model",
     "fit_mixed_model",
     "holm",
     "log_rank",

@@ -183,8 +183,11 @@ def _best_theta(model: _Reml) -> FloatArray:
     return theta
 
 
-def _satterthwaite(model: _Reml, parameters: FloatArray) -> float:
-    """Degrees of freedom of the slope from the curvature of the deviance in (theta, sigma)."""
+def satterthwaite(model: Any, parameters: FloatArray) -> float:
+    """Degrees of freedom of the slope from the curvature of the deviance in (theta, sigma).
+
+    The model has ``n``, ``slope_variance`` and ``deviance`` of the four parameters.
+    """
     step = 1e-4 * np.maximum(np.abs(parameters), 0.1)
     shifts = np.diag(step)
     gradient = np.array(
@@ -270,18 +273,38 @@ def fit_mixed_model(x: Any, y: Any, group: Any) -> MixedModel:
     theta = _best_theta(model)
     _, information, beta, residual = model.solve(theta)
     sigma = float(np.sqrt(residual / (model.n - 2)))
-    df = _satterthwaite(model, np.r_[theta, sigma])
-    # Back to the units of x and y: [1, x] = [1, z] T.
+    return in_units(
+        theta, sigma, beta, sigma**2 * np.linalg.inv(information),
+        df=satterthwaite(model, np.r_[theta, sigma]), criterion=model.criterion(theta),
+        x=(shift, scale), y=(level, spread), size=size,
+    )  # fmt: skip
+
+
+def in_units(
+    theta: FloatArray,
+    sigma: float,
+    beta: FloatArray,
+    covariance: Any,
+    *,
+    df: float,
+    criterion: float,
+    x: tuple[float, float],
+    y: tuple[float, float],
+    size: dict[str, Any],
+) -> MixedModel:
+    """Fit of the standardised data in the units of x and y, given their means and spreads."""
+    (shift, scale), (level, spread) = x, y
+    # [1, x] = [1, z] T.
     back = np.array([[1.0, -shift / scale], [0.0, 1.0 / scale]])
     effect = spread * back @ beta + np.array([level, 0.0])
-    covariance = (sigma * spread) ** 2 * back @ np.linalg.inv(information) @ back.T
-    factor = sigma * spread * back @ np.array([[theta[0], 0.0], [theta[1], theta[2]]])
+    covariance = spread**2 * back @ covariance @ back.T
+    relative = np.array([[theta[0], 0.0], [theta[1], theta[2]]])
+    factor = sigma * spread * back @ relative
     random = factor @ factor.T
     sd = np.sqrt(np.diag(random))
     error = float(np.sqrt(covariance[1, 1]))
     t = float(effect[1] / error)
     reach = float(stats.t.ppf(0.975, df) * error)
-    axes = np.linalg.svd(np.array([[theta[0], 0.0], [theta[1], theta[2]]]), compute_uv=False)
     return MixedModel(
         slope=float(effect[1]),
         std_error=error,
@@ -295,9 +318,7 @@ def fit_mixed_model(x: Any, y: Any, group: Any) -> MixedModel:
         sd_slope=float(sd[1]),
         correlation=float(random[0, 1] / (sd[0] * sd[1])) if sd.all() else None,
         residual_sd=sigma * spread,
-        reml_criterion=float(
-            model.criterion(theta) + 2 * np.log(scale) + 2 * (model.n - 2) * np.log(spread)
-        ),
-        singular=bool(axes[1] < 1e-4),
+        reml_criterion=float(criterion + 2 * np.log(scale) + 2 * (size["n"] - 2) * np.log(spread)),
+        singular=bool(np.linalg.svd(relative, compute_uv=False)[1] < 1e-4),
         **size,
     )

@@ -5,13 +5,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cellquant.statistics.censored import fit_censored_model
 from cellquant.statistics.comparisons import log_rank, mann_whitney, mean_over_trials
 from cellquant.statistics.mixed import fit_mixed_model
 
 CENSORING_RULE = (
-    "a tau_alpha that is only known to exceed the longest lag, or to be below the shortest, stays "
-    "out of the fit and of the mean; the fit is repeated with it at that bound (at_bound), means "
-    "over bins that hold such values are given as bounds, and their number is stated"
+    "a tau_alpha that is only known to exceed the longest lag, or to be below the shortest, enters "
+    "the mixed model as that: with the probability to lie beyond its bound (Tobit). Beside it "
+    "stand the fits without such points (without_bounds) and with each at its bound (at_bound). "
+    "Means over bins that hold such values are given as bounds, and their number is stated"
+)
+
+
+CENSORED_METHOD = (
+    "restricted likelihood with bounds as bounds (Tobit), random effects integrated out"
 )
 
 
@@ -27,8 +34,11 @@ def tau_alpha_trend(relaxation_times: pd.DataFrame) -> dict[str, Any]:
     Returns
     -------
     dict
-        Per condition the fields of `MixedModel`, ``at_bound`` (slope, std_error and p_value with
-        every bound taken as a value) where there are bounds, n_censored, n_below.
+        Per condition the fields of `MixedModel`, method, n_censored, n_below. Where there are
+        bounds the model is that of `fit_censored_model`, and ``without_bounds`` and ``at_bound``
+        hold slope, std_error, p_value and interval_95 of the fits without them and with each
+        taken as a value. Where that model has no answer the fit without bounds stands in its
+        place and ``bounds_reason`` says why.
     """
     found = {}
     for condition, rows in _conditions(relaxation_times):
@@ -36,15 +46,23 @@ def tau_alpha_trend(relaxation_times: pd.DataFrame) -> dict[str, Any]:
         bound = _bounds(rows)
         bounded = ~np.isfinite(value) & np.isfinite(bound)
         density, trial = rows["density"].to_numpy(dtype=np.float64), rows["trial"].to_numpy(str)
-        entry = fit_mixed_model(density, value, trial).as_dict()
+        plain = fit_mixed_model(density, value, trial)
+        entry = {**plain.as_dict(), "method": "restricted maximum likelihood"}
+        if bounded.any():
+            lower, upper = (rows[k].to_numpy(dtype=np.float64) for k in ("censored_at", "below"))
+            censored = fit_censored_model(density, value, trial, lower=lower, upper=upper)
+            if censored.reason is None:
+                entry = {**censored.as_dict(), "method": CENSORED_METHOD}
+            else:
+                entry["bounds_reason"] = censored.reason
+            at_bound = fit_mixed_model(density, np.where(bounded, bound, value), trial)
+            for name, fit in (("without_bounds", plain), ("at_bound", at_bound)):
+                entry[name] = {
+                    "slope": fit.slope, "std_error": fit.std_error, "p_value": fit.p_value,
+                    "interval_95": fit.interval_95, "n": fit.n,
+                }  # fmt: skip
         entry["n_censored"] = int(np.isfinite(rows["censored_at"].to_numpy(np.float64)).sum())
         entry["n_below"] = int(np.isfinite(rows["below"].to_numpy(np.float64)).sum())
-        if bounded.any():
-            again = fit_mixed_model(density, np.where(bounded, bound, value), trial)
-            entry["at_bound"] = {
-                "slope": again.slope, "std_error": again.std_error, "p_value": again.p_value,
-                "interval_95": again.interval_95,
-            }  # fmt: skip
         found[condition] = entry
     return found
 
