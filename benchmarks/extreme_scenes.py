@@ -139,19 +139,19 @@ def outcome(changes):
 
 
 def main(names=None):
-    table = {}
-    for name, changes in SCENES.items():
-        if names and name not in names:
-            continue
-        table[name] = outcome(changes)
-        print(f"{name:24s} {table[name]}", flush=True)
-        if not names:
-            RESULTS.mkdir(exist_ok=True)
-            (RESULTS / "extreme_scenes.json").write_text(json.dumps(table, indent=1) + "\n")
-    return table
+    """Try all scenes, or renew some of the stored ones."""
+    path = RESULTS / "extreme_scenes.json"
+    stored = json.loads(path.read_text()) if names else {}
+    for name in names or SCENES:
+        stored[name] = outcome(SCENES[name])
+        print(f"{name:24s} {stored[name]}", flush=True)
+        table = {known: stored[known] for known in SCENES if known in stored}
+        RESULTS.mkdir(exist_ok=True)
+        path.write_text(json.dumps(table, indent=1) + "\n")
+    return stored
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", help="scenes to try; all, and stored, without any")
+    parser.add_argument("names", nargs="*", help="scenes to try again; all without any")
     main(parser.parse_args().names)

@@ -122,6 +122,9 @@ def run_lines(run: "Run") -> list[str]:
         f"saved: {run.n_frames} states, one every {settings['save_every']:g} t0, "
         f"after {settings['transient']:g} t0",
     ]
+    simulated = settings["transient"] + (run.n_frames - 1) * settings["save_every"]
+    if work.get("cpu_seconds"):
+        lines.append(f"speed: {simulated / work['cpu_seconds']:.3g} t0 per second of CPU time")
     shown = {k: v for k, v in sorted(work.items()) if not k.startswith(("pinched", "repaired"))}
     lines += [f"{name.replace('_', ' ')}: {value:.6g}" for name, value in shown.items()]
     if work.get("repaired"):

@@ -20,6 +20,7 @@ ROOT_DEPTH = 2  # a root of the Brownian tree spans 2^2 steps
 WATCH_EVERY = 16  # steps between two checks of the step length
 CHATTER_LIMIT = 0.02  # RMS change of the displacement from one step to the next, L0
 LONGEST_MOVE = 0.1  # of a cell within one implicit step, in units of the mean radius
+LARGEST_CHANGE = 0.03  # of a shape mode within one implicit step
 JUMP = 0.5  # the same for explicit steps, which only an instability takes
 REPAIRS = 6  # halvings of an equal step that failed
 DEEPEST = 14  # halvings of a frame interval that the adaptive method may make
@@ -51,9 +52,9 @@ class Plan:
 class FixedSteps:
     """Equal steps of one method, watched for steps that are too long.
 
-    An implicit step in which a cell moves too far, or a shape ceases to be one, is repeated in 2,
-    4, ... parts. Explicit steps that are too long stop the run: in parts they would only chatter
-    less visibly.
+    An implicit step in which a cell moves too far, a shape changes too much or ceases to be one, is
+    repeated in 2, 4, ... parts. Explicit steps that are too long stop the run: in parts they would
+    only chatter less visibly.
 
     Attributes
     ----------
@@ -121,12 +122,16 @@ class FixedSteps:
             if self.layer.scene.has_noise:
                 ws, areas = self._tree.level(root, ROOT_DEPTH + halvings)
                 w, area = ws[part], areas[part]
-            start = state[:, :2].copy()
+            start = state.copy()
             self._method.step(state, h, w, area)
-            start -= state[:, :2]
-            if not max(start.max(), -start.min()) < limit:
-                cell = int(np.argmax(np.abs(start).max(axis=1)))
+            start -= state
+            moved = np.abs(start, out=start)
+            if not moved[:, :2].max() < limit:
+                cell = int(np.argmax(moved[:, :2].max(axis=1)))
                 raise SimulationFailure("a cell moves too far within one step", REMEDY, cell=cell)
+            if not (self._explicit or moved[:, 3:].max(initial=0.0) < LARGEST_CHANGE):
+                cell = int(np.argmax(moved[:, 3:].max(axis=1)))
+                raise SimulationFailure("a shape changes too much in one step", REMEDY, cell=cell)
 
     def _repair(
         self, state: Floats, before: Floats, index: int, failure: SimulationFailure
