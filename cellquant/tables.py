@@ -299,6 +299,8 @@ def read_table(
         arrow = pq.read_table(path, columns=None if columns is None else list(columns))
         # Each column is freed as soon as it is converted, or the table would be held twice.
         table = arrow.to_pandas(split_blocks=True, self_destruct=True)
+        del arrow
+        pa.default_memory_pool().release_unused()
     except KeyError as error:
         raise InputError(
             f"{path} carries no {error} in its schema metadata, so its numbers have no unit; "
