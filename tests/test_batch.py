@@ -15,7 +15,7 @@ import tifffile
 
 from cellquant.batch import run_experiment
 from cellquant.errors import InputError
-from cellquant.storage import only_writer
+from cellquant.lock import only_writer
 from examples import drifting_discs, shuffled
 
 HEAD = """
