@@ -80,6 +80,12 @@ def find_stacks(config: ExperimentConfig, base: Path) -> list[Task]:
     return tasks
 
 
+def count_stacks(path: str | Path) -> int:
+    """Number of stacks of an experiment file."""
+    path = Path(path)
+    return len(find_stacks(load(path, ExperimentConfig), path.parent))
+
+
 def _matches(
     patterns: list[str], base: Path, condition: ConditionConfig, trial: TrialConfig
 ) -> list[Path]:

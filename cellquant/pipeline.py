@@ -246,7 +246,10 @@ def observe_source(
         Keyword arguments of `cellquant.observables.observe`.
     """
     folder = check_output(out)
-    record = RunRecord("observe", {"source": str(source), "only": only, **(options or {})})
+    record = RunRecord(
+        "observe",
+        {"source": str(source), "only": only, "calibration": calibration, **(options or {})},
+    )
     with record.stage("read"):
         data = open_source(
             source,

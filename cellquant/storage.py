@@ -251,7 +251,7 @@ def remove_partial(folder: Path, *, below: bool = True) -> None:
 
 def disk_problem(error: BaseException) -> str | None:
     """One sentence for a disk that is full, read-only or closed to us; None for other errors."""
-    if not isinstance(error, OSError) or error.errno not in _DISK_ERRORS:
+    if not isinstance(error, OSError) or error.errno is None or error.errno not in _DISK_ERRORS:
         return None
     what = f"cannot write {error.filename}" if error.filename else "cannot write the results"
     return (
@@ -314,6 +314,7 @@ class RunRecord:
             "code": code_digest("pipeline"),
             "libraries": libraries(),
             "command": self.command,
+            "working_folder": os.getcwd(),
             "settings": dict(self.settings),
             "inputs": self.inputs,
             "notes": self.notes,

@@ -67,6 +67,11 @@ def sweep_tasks(config: SweepConfig, folder: Path) -> list[Task]:
     return tasks
 
 
+def count_runs(path: str | Path) -> int:
+    """Number of runs of a sweep file."""
+    return len(load(path, SweepConfig).scenes())
+
+
 def work_on_scene(task: Task) -> None:
     """Simulate and observe one scene, going on from its checkpoint where there is one."""
     check_code(task, "sweep")

@@ -32,6 +32,9 @@ ALLOWED: dict[str, set[str]] = {
     "batch": FOUNDATION
     | {"observables", "segment", "track", "sim", "compare", "pipeline", "engines", "study"},
     "sweep": FOUNDATION | {"observables", "sim", "pipeline", "engines"},
+    "slurm": FOUNDATION,
+    "estimate": FOUNDATION | {"observables", "sim"},
+    "rerun": FOUNDATION | {"sim", "pipeline", "batch", "sweep"},
     "closed_loop": FOUNDATION | {"observables", "segment", "track", "sim", "pipeline"},
     "demo": FOUNDATION | {"observables", "track", "sim", "compare", "pipeline", "closed_loop"},
 }
