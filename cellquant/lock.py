@@ -45,9 +45,11 @@ def only_writer(folder: Path, *, wait: bool = False) -> Iterator[None]:
     content = json.dumps({"token": token, **_this_process()}, sort_keys=True)
     seen: tuple[str, int] | None = None
     seen_at = 0.0
-    while not _take(path, content):
+    while True:
         found = _look(path)
         if found is None:
+            if _take(path, content):
+                break
             continue
         now = time.monotonic()
         first = seen is None
@@ -70,6 +72,8 @@ def only_writer(folder: Path, *, wait: bool = False) -> Iterator[None]:
             _remove(path, found[0])
             continue
         time.sleep(_PAUSE)
+    for left in folder.glob(f"{LOCK}.*.partial"):  # of those that were killed while they took it
+        left.unlink(missing_ok=True)
     stop = threading.Event()
     beating = threading.Thread(target=_beat, args=(path, stop), daemon=True)
     beating.start()
@@ -88,7 +92,7 @@ def _take(path: Path, content: str) -> bool:
         own.write_text(content, encoding="utf-8")
         try:
             os.link(own, path)
-        except FileExistsError:
+        except (FileExistsError, FileNotFoundError):
             return False
         except OSError:  # a file system without hard links
             try:

@@ -99,7 +99,11 @@ def append_frames(group: Any, start: int, times: Floats, states: Floats) -> None
 
 
 def write_checkpoint(path: Path, **arrays: Any) -> None:
-    """Replace the checkpoint of a run in one move."""
+    """Replace the checkpoint of a run in one move, once the frames it counts on are on the disk."""
+    for chunk in path.glob("*/c/**/*"):
+        if chunk.is_file():
+            with open(chunk, "rb") as file:
+                os.fsync(file.fileno())
     partial = path / (CHECKPOINT + ".partial")
     with open(partial, "wb") as file:
         np.savez(file, **arrays)
