@@ -21,6 +21,7 @@ from typing import Any
 
 from cellquant.errors import InputError
 from cellquant.fingerprint import code_digest
+from cellquant.lock import remove_stale
 from cellquant.storage import disk_problem, finished_key
 
 Task = dict[str, Any]
@@ -100,6 +101,8 @@ def run_tasks(
         Called with (tasks finished, tasks in all) at the start and whenever one has ended.
     """
     waiting = [t for t in tasks if finished_key(Path(t["folder"]), command) != t["key"]]
+    for task in tasks:
+        remove_stale(Path(task["folder"]))
     skipped = len(tasks) - len(waiting)
     outcomes: list[Outcome] = []
     if on_finished is not None:

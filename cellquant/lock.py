@@ -85,6 +85,15 @@ def only_writer(folder: Path, *, wait: bool = False) -> Iterator[None]:
         _remove(path, content)
 
 
+def remove_stale(folder: Path) -> None:
+    """Remove the lock that a killed process left in a folder; that of a living one stays."""
+    if any(folder.glob(f"{LOCK}*")):
+        found = _look(folder / LOCK)
+        if found is None or _is_gone(found[0]):
+            with contextlib.suppress(InputError), only_writer(folder):
+                pass
+
+
 def _take(path: Path, content: str) -> bool:
     """Make the lock file whole or not at all: written under a name of its own, then linked."""
     own = path.with_name(f"{LOCK}.{uuid.uuid4().hex}.partial")

@@ -183,16 +183,18 @@ def sweep_config(
 
     with only_writer(folder):
         remove_partial(folder, below=False)
-        with record.stage("runs"):
-            outcome = run_tasks(
-                work_on_scene,
-                tasks,
-                command="sweep",
-                workers=workers,
-                scheduler=scheduler,
-                on_finished=keep_up,
-            )
-        gathered.write()
+        try:
+            with record.stage("runs"):
+                outcome = run_tasks(
+                    work_on_scene,
+                    tasks,
+                    command="sweep",
+                    workers=workers,
+                    scheduler=scheduler,
+                    on_finished=keep_up,
+                )
+        finally:  # also of a sweep that is interrupted or loses its cluster
+            gathered.write()
         record.counts = {"runs": len(tasks), "failed": len(outcome.failures)}
         record.notes = [f"{name}: {reason}" for name, reason in outcome.failures.items()]
         write_json(folder / "failures.json", outcome.failures)

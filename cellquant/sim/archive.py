@@ -18,6 +18,7 @@ from cellquant import __version__
 from cellquant.errors import InputError
 from cellquant.sim.scene import Scene
 from cellquant.sim.shapes import measure_shapes, shape_indices
+from cellquant.storage import atomic_path
 from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
 
 Floats = NDArray[np.float64]
@@ -104,12 +105,8 @@ def write_checkpoint(path: Path, **arrays: Any) -> None:
         if chunk.is_file():
             with open(chunk, "rb") as file:
                 os.fsync(file.fileno())
-    partial = path / (CHECKPOINT + ".partial")
-    with open(partial, "wb") as file:
-        np.savez(file, **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path / CHECKPOINT)
+    with atomic_path(path / CHECKPOINT) as partial:
+        np.savez(partial, **arrays)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
