@@ -4,6 +4,7 @@ Relative paths start at the file that names them. Unknown keys are refused, so t
 never falls back to a default in silence.
 """
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cellquant.errors import InputError
 
+MAX_RUNS = 1_000_000
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -176,6 +178,11 @@ class SweepConfig(_Strict):
             raise ValueError(f"{', '.join(both)} stands in both [scene] and [grid]; keep one")
         if "seed" in self.scene or "seed" in self.grid:
             raise ValueError("seeds are given by the key 'seeds', not inside [scene] or [grid]")
+        number = len(self.seeds) * (
+            math.prod(len(values) for values in self.grid.values()) + len(self.points)
+        )
+        if number > MAX_RUNS:
+            raise ValueError(f"the sweep has {number} runs; divide it, {MAX_RUNS} are the most")
         self.scenes()
         return self
 

@@ -243,7 +243,11 @@ def _row(task: Task) -> dict[str, Any] | None:
     if finished_key(folder, "sweep") != task["key"]:
         return None
     summary = json.loads((folder / "summary.json").read_text("utf-8"))
-    row: dict[str, Any] = {k: v for k, v in task["scene"].items() if v is not None}
+    row: dict[str, Any] = {
+        name: json.dumps(value) if isinstance(value, list | tuple) else value
+        for name, value in task["scene"].items()
+        if value is not None
+    }
     for name, place in RESULTS.items():
         group, part = place.split(".")
         found: Mapping[str, Any] = summary.get(group) or {}

@@ -13,7 +13,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "cellquant"
 FOUNDATION = {"errors", "tables", "storage", "lock", "fingerprint", "config", "io"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
-    "tables": {"errors"},
+    "parquet": {"errors"},
+    "tables": {"errors", "parquet"},
     "lock": {"errors"},
     "fingerprint": set(),
     "storage": {"errors", "lock", "fingerprint"},
