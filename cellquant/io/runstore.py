@@ -88,7 +88,7 @@ def _check_array(path: Path) -> tuple[int, ...]:
     name = path.name
     shape = _integers(content.get("shape"), 0)
     grid = content.get("chunk_grid")
-    chunk = ()
+    chunk: tuple[int, ...] = ()
     if isinstance(grid, dict) and grid.get("name") == "regular":
         configuration = grid.get("configuration")
         if isinstance(configuration, dict):

@@ -73,9 +73,10 @@ def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> Any:
     check_run_store(path)
     try:
         group = zarr.open_group(zarr.storage.LocalStore(path, read_only=mode == "r"), mode=mode)
-        Scene.from_dict(dict(group.attrs["scene"]))
-        settings = group.attrs["settings"]
-        if not all(name in settings for name in _SETTINGS) or "status" not in group.attrs:
+        attributes: dict[str, Any] = dict(group.attrs)
+        Scene.from_dict(dict(attributes["scene"]))
+        missing = set(_SETTINGS) - set(attributes["settings"])
+        if missing or "status" not in attributes:
             raise ValueError("its settings are not complete")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
