@@ -1,6 +1,6 @@
 """Faults at random moments of a study and of a sweep: the same command then ends in equal bytes.
 
-    python benchmarks/fault_campaign.py [--kills 220] [--errors 40] [--commands 24] [--seed 1]
+    python benchmarks/fault_campaign.py [--kills 220] [--errors 40] [--commands 24] [--job run]
 
 Each fault strikes a job in an empty folder; the job is then given again, without a fault, and
 every table, summary, stack report and simulated array must equal those of a job that was never
@@ -12,7 +12,8 @@ disturbed. Faults:
 - command: a real `cellquant` process with two workers loses a worker, its parent, or all of them
 
 The first three fork a process in which everything is loaded and compiled, so that a fault costs a
-second or two. Writes benchmarks/results/fault_campaign.json and the table of docs/reliability.md.
+second or two. Writes benchmarks/results/fault_campaign_*.json after every fault, goes on from there
+when it is given again, and writes the table of docs/reliability.md.
 """
 
 import argparse
@@ -40,7 +41,6 @@ os.environ.update(
 )  # fmt: skip
 
 HERE = Path(__file__).resolve().parent
-RESULTS = HERE / "results" / "fault_campaign.json"
 PAGE = HERE.parent / "docs" / "reliability.md"
 BEGIN, END = "<!-- faults: generated -->", "<!-- end -->"
 EVENTS = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate"}
@@ -272,38 +272,39 @@ FAULTS = {
 }
 
 
-def campaign(counts: dict[str, int], seed: int, folder: Path) -> list[dict[str, Any]]:
-    """Strike each job as often as `counts` says for each kind of fault; one row per fault."""
-    rows = []
-    rng = random.Random(seed)
-    for job in jobs(folder):
-        place = folder / job.name
-        place.mkdir()
-        measure(job, place)
+def campaign(job: Job, counts: dict[str, int], seed: int, place: Path, results: Path) -> None:
+    """Strike a job as often as `counts` says for each kind of fault; goes on where it stopped.
+
+    The results are written after every fault, one row each.
+    """
+    place.mkdir()
+    measure(job, place)
+    rows = read_rows(results)
+    for number in range(max(counts.values())):  # all kinds in turn, so that a part is a sample
         for kind, count in counts.items():
-            for _ in range(count):
-                out = place / "out"
-                shutil.rmtree(out, ignore_errors=True)
-                what = FAULTS[kind](job, out, rng)
-                started = time.perf_counter()
-                problem = check(job, out)
-                if "EXIT CODE" in what:
-                    problem = f"{what}; {problem}"
-                if len(rows) % 20 == 0:
-                    print(f"{job.name}: {len(rows)} faults so far", flush=True)
-                rows.append(
-                    {
-                        "job": job.name,
-                        "fault": kind,
-                        "where": what,
-                        "problem": problem,
-                        "finish_s": round(time.perf_counter() - started, 2),
-                    }
-                )
-                if problem:
-                    print(f"{job.name}, {kind}, {what}: {problem}", file=sys.stderr, flush=True)
-        print(f"{job.name}: {sum(r['job'] == job.name for r in rows)} faults", flush=True)
-    return rows
+            name = f"{job.name}, {kind}, seed {seed}, number {number}"
+            if number >= count or any(row["name"] == name for row in rows):
+                continue
+            out = place / "out"
+            shutil.rmtree(out, ignore_errors=True)
+            where = FAULTS[kind](job, out, random.Random(name))
+            problem = check(job, out)
+            if "EXIT CODE" in where:
+                problem = f"{where}; {problem}"
+            row = {"name": name, "job": job.name, "fault": kind, "where": where}
+            rows.append({**row, "problem": problem})
+            results.write_text(json.dumps(rows, indent=1) + "\n")
+            if problem:
+                print(f"{name}, {where}: {problem}", file=sys.stderr, flush=True)
+        print(f"{job.name}: {len(rows)} faults", flush=True)
+
+
+def results_of(job: str) -> Path:
+    return HERE / "results" / f"fault_campaign_{job}.json"
+
+
+def read_rows(results: Path) -> list[dict[str, Any]]:
+    return list(json.loads(results.read_text())) if results.is_file() else []
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -325,6 +326,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=220)
     parser.add_argument("--errors", type=int, default=40)
     parser.add_argument("--commands", type=int, default=24)
+    parser.add_argument("--job", choices=("run", "sweep"), help="both when absent")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     counts = {
@@ -335,8 +337,11 @@ def main() -> None:
     }
     memory = "/dev/shm" if Path("/dev/shm").is_dir() else None  # a kill needs no real disk
     with tempfile.TemporaryDirectory(dir=memory) as name:
-        rows = campaign(counts, arguments.seed, Path(name))
-    RESULTS.write_text(json.dumps({"seed": arguments.seed, "faults": rows}, indent=1) + "\n")
+        for job in jobs(Path(name)):
+            if arguments.job in (None, job.name):
+                place = Path(name) / job.name
+                campaign(job, counts, arguments.seed, place, results_of(job.name))
+    rows = [row for job in ("run", "sweep") for row in read_rows(results_of(job))]
     page = PAGE.read_text(encoding="utf-8")
     before, rest = page.split(BEGIN)
     after = rest.split(END)[1]

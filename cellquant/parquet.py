@@ -1,13 +1,12 @@
 """What a parquet file promises, checked against its size before anything is decoded.
 
-A footer may claim 10^12 rows, and a page of some bytes may claim to hold gigabytes. The headers of
-all pages are read here with nothing but Python; only then is the file given to Arrow.
+A footer may claim 10^12 rows, and a page of some bytes may claim to hold gigabytes. Footer and
+page headers are read here with nothing but Python; only then is the file given to Arrow.
 
-Reference: the Parquet format (parquet.thrift, structs PageHeader and ColumnMetaData) and the
+Reference: the Parquet format (parquet.thrift, structs FileMetaData and PageHeader) and the
 compact protocol of Apache Thrift.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,7 +23,8 @@ MAX_PAGE = 2**24
 _MAX_HEADER = 2**16
 #: Largest text column once it is decoded.
 MAX_TEXT = 2**28
-_KINDS = {"BOOLEAN", "INT32", "INT64", "FLOAT", "DOUBLE", "BYTE_ARRAY"}
+_KINDS = {0, 1, 2, 4, 5, 6}  # boolean, int32, int64, float, double, byte array
+_CODECS = {0, 1, 2, 6}  # none, snappy, gzip, zstd
 
 
 class _Damaged(ValueError):
@@ -37,37 +37,111 @@ def check_promises(path: Path) -> pa.Schema:
     Raises
     ------
     InputError
-        If the file promises more rows or larger pages than it can hold, or has columns that are
-        no plain numbers, truth values or texts.
+        If the file is damaged, promises more rows or larger pages than it can hold, or has columns
+        that are no plain numbers, truth values or texts.
     pyarrow.ArrowException, OSError, ValueError
-        If its footer cannot be read.
+        If its schema cannot be read.
     """
     size = path.stat().st_size
-    with pq.ParquetFile(path) as file:
-        metadata, schema = file.metadata, file.schema_arrow
-    rows = metadata.num_rows
-    if not 0 <= rows <= MAX_ROWS_PER_BYTE * size:
-        raise InputError(
-            f"{path} promises {rows} rows in {size} bytes, more than any table of that size holds; "
-            "make it again from its source."
-        )
     try:
-        if metadata.num_columns != len(schema.names):
-            raise _Damaged("it has nested columns")
-        total = 0
         with path.open("rb") as stream:
-            for number in range(metadata.num_row_groups):
-                group = metadata.row_group(number)
-                total += group.num_rows
-                if group.num_rows < 0 or total > rows:
+            content = _footer(stream, size)
+            rows = _whole(content, 3)
+            if not 0 <= rows <= MAX_ROWS_PER_BYTE * size:
+                raise InputError(
+                    f"{path} promises {rows} rows in {size} bytes, more than any table of that "
+                    "size holds; make it again from its source."
+                )
+            leaves = _leaves(content)
+            total = 0
+            for group in _structs(content, 4):
+                number, columns = _whole(group, 3), _structs(group, 1)
+                total += number
+                if number < 0 or total > rows:
                     raise _Damaged(f"its row groups hold more than its {rows} rows")
-                for index in range(group.num_columns):
-                    _check_column(stream, size, group.column(index), group.num_rows)
+                if len(columns) != len(leaves):
+                    raise _Damaged("a row group lacks columns")
+                for column, leaf in zip(columns, leaves, strict=True):
+                    _check_column(stream, size, column, leaf, number)
+            if total != rows:
+                raise _Damaged(f"its row groups hold {total} of its {rows} rows")
     except _Damaged as error:
         raise InputError(
-            f"{path} is damaged or no table of cellquant: {error}; make it again from its source."
+            f"{path} is no readable parquet table of cellquant: {error}; "
+            "make it again from its source."
         ) from error
-    return schema
+    # Arrow ends the process where parts of a footer contradict each other: only now may it look.
+    return pq.read_schema(path)
+
+
+def _footer(stream: BinaryIO, size: int) -> dict[int, Any]:
+    stream.seek(max(0, size - 8))
+    tail = stream.read(8)
+    length = int.from_bytes(tail[:4], "little")
+    if size < 12 or tail[4:] != b"PAR1" or not 0 < length <= size - 12:
+        raise _Damaged("it does not end as a parquet file does")
+    stream.seek(size - 8 - length)
+    return _parse(stream.read(length))[0]
+
+
+def _leaves(content: dict[int, Any]) -> list[tuple[bytes, int]]:
+    """Name and physical type of every column of a flat schema."""
+    elements = _structs(content, 2)
+    if not elements or _whole(elements[0], 5) != len(elements) - 1:
+        raise _Damaged("its columns are nested or not complete")
+    leaves = []
+    for element in elements[1:]:
+        name, kind = element.get(4), element.get(1)
+        if not isinstance(name, bytes) or 5 in element or kind not in _KINDS:
+            raise _Damaged("a column is nested or of a type that no table here has")
+        if element.get(3, 0) not in (0, 1):
+            raise _Damaged("a column holds lists")
+        leaves.append((name, kind))
+    return leaves
+
+
+def _check_column(
+    stream: BinaryIO, size: int, column: dict[int, Any], leaf: tuple[bytes, int], rows: int
+) -> None:
+    name = leaf[0][:40]
+    inner = column.get(3)
+    if not isinstance(inner, dict) or 1 in column or inner.get(1) != leaf[1]:
+        raise _Damaged(f"column {name!r} is not described")
+    if inner.get(3) != [leaf[0]] or inner.get(4) not in _CODECS:
+        raise _Damaged(f"column {name!r} has another name or compression")
+    if not 0 <= _whole(inner, 5) <= rows:
+        raise _Damaged(f"column {name!r} has more values than rows")
+    if rows == 0:  # nothing is read of a group without rows
+        return
+    start = _whole(inner, 9)
+    if 11 in inner and _whole(inner, 11) > 0:
+        start = min(start, _whole(inner, 11))
+    stop = start + _whole(inner, 7)
+    if not 4 <= start < stop <= size:
+        raise _Damaged(f"column {name!r} lies outside its {size} bytes")
+    while start < stop:
+        stream.seek(start)
+        header, length = _parse(stream.read(min(_MAX_HEADER, stop - start)))
+        unpacked, packed = _whole(header, 2), _whole(header, 3)
+        if not 0 <= unpacked <= MAX_PAGE:
+            raise _Damaged(f"a page of column {name!r} promises {unpacked} bytes")
+        if packed < 0 or start + length + packed > stop:
+            raise _Damaged(f"a page of column {name!r} lies outside its column")
+        start += length + packed
+
+
+def _whole(content: dict[int, Any], field: int) -> int:
+    value = content.get(field)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise _Damaged(f"field {field} of a description is missing")
+    return value
+
+
+def _structs(content: dict[int, Any], field: int) -> list[dict[int, Any]]:
+    value = content.get(field, [])
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise _Damaged(f"field {field} of a description is no list")
+    return value
 
 
 def decode_texts(path: Path, table: pa.Table) -> pa.Table:
@@ -96,98 +170,65 @@ def text_columns(schema: pa.Schema) -> list[str]:
     ]
 
 
-def _check_column(stream: BinaryIO, size: int, column: Any, rows: int) -> None:
-    name = column.path_in_schema
-    if column.physical_type not in _KINDS:
-        raise _Damaged(f"column {name[:40]!r} has the type {column.physical_type}")
-    starts = [column.data_page_offset]
-    if column.has_dictionary_page and column.dictionary_page_offset:
-        starts.append(column.dictionary_page_offset)
-    start = min(starts)
-    stop = start + column.total_compressed_size
-    if not 4 <= start <= stop <= size:
-        raise _Damaged(f"column {name[:40]!r} lies outside its {size} bytes")
-    if column.num_values > rows:
-        raise _Damaged(f"column {name[:40]!r} has more values than rows")
-    while start < stop:
-        stream.seek(start)
-        header = stream.read(min(_MAX_HEADER, stop - start))
-        unpacked, packed, length = _page_sizes(header)
-        if not 0 <= unpacked <= MAX_PAGE:
-            raise _Damaged(f"a page of column {name[:40]!r} promises {unpacked} bytes")
-        if packed < 0 or start + length + packed > stop:
-            raise _Damaged(f"a page of column {name[:40]!r} lies outside its column")
-        start += length + packed
-
-
-def _page_sizes(header: bytes) -> tuple[int, int, int]:
-    """Size of a page before and after compression, and length of its header."""
-    fields: dict[int, int] = {}
+def _parse(data: bytes) -> tuple[dict[int, Any], int]:
+    """A struct of the compact protocol as a dictionary by field number, and its length."""
     try:
-        position = _read_struct(header, 0, fields, 0)
-        return fields[2], fields[3], position
-    except (IndexError, KeyError) as error:
-        raise _Damaged("a page header is incomplete") from error
+        return _struct(data, 0, 0)
+    except IndexError as error:
+        raise _Damaged("a description is incomplete") from error
 
 
-def _read_struct(data: bytes, position: int, fields: dict[int, int] | None, depth: int) -> int:
-    """Skip a struct of the compact protocol; keeps its integers by field number."""
-    if depth > 8:
-        raise _Damaged("a page header is nested too deeply")
+def _struct(data: bytes, position: int, depth: int) -> tuple[dict[int, Any], int]:
+    if depth > 10:
+        raise _Damaged("a description is nested too deeply")
+    fields: dict[int, Any] = {}
     number = 0
     while True:
         head = data[position]
         position += 1
         if head == 0:
-            return position
+            return fields, position
         kind, step = head & 0x0F, head >> 4
         if step:
             number += step
         else:
             value, position = _varint(data, position)
             number = (value >> 1) ^ -(value & 1)
-        if kind in (4, 5, 6):
-            value, position = _varint(data, position)
-            if fields is not None:
-                fields[number] = (value >> 1) ^ -(value & 1)
+        if kind in (1, 2):  # the truth value is in the head
+            fields[number] = kind == 1
         else:
-            position = _skip(data, position, kind, depth)
+            fields[number], position = _value(data, position, kind, depth)
 
 
-def _skip(data: bytes, position: int, kind: int, depth: int) -> int:
-    if kind in (1, 2):  # true, false: in the field's head
-        return position
-    if kind == 3:
-        return position + 1
+def _value(data: bytes, position: int, kind: int, depth: int) -> tuple[Any, int]:
+    if kind in (1, 2, 3):
+        return data[position], position + 1
     if kind in (4, 5, 6):
-        return _varint(data, position)[1]
+        value, position = _varint(data, position)
+        return (value >> 1) ^ -(value & 1), position
     if kind == 7:
-        return position + 8
-    if kind == 8:  # bytes, e.g. the bounds in the statistics
+        return data[position : position + 8], position + 8
+    if kind == 8:
         length, position = _varint(data, position)
-        return position + length
+        if position + length > len(data):
+            raise _Damaged("a description is incomplete")
+        return data[position : position + length], position + length
     if kind in (9, 10):
-        for item in _items(data, position):
-            position = item
-        return position
+        head = data[position]
+        position += 1
+        inner, count = head & 0x0F, head >> 4
+        if count == 15:
+            count, position = _varint(data, position)
+        if count > len(data) - position:
+            raise _Damaged("a list is longer than its description")
+        items = []
+        for _ in range(count):
+            item, position = _value(data, position, inner, depth + 1)
+            items.append(item)
+        return items, position
     if kind == 12:
-        return _read_struct(data, position, None, depth + 1)
-    raise _Damaged("a page header has an unknown field")
-
-
-def _items(data: bytes, position: int) -> Iterator[int]:
-    """Positions behind the head and behind each item of a list."""
-    head = data[position]
-    position += 1
-    kind, count = head & 0x0F, head >> 4
-    if count == 15:
-        count, position = _varint(data, position)
-    yield position
-    for _ in range(count):
-        position = position + 1 if kind in (1, 2) else _skip(data, position, kind, 8)
-        if position > len(data):
-            raise _Damaged("a page header is incomplete")
-        yield position
+        return _struct(data, position, depth + 1)
+    raise _Damaged("a description has an unknown field")
 
 
 def _varint(data: bytes, position: int) -> tuple[int, int]:

@@ -94,6 +94,12 @@ def test_damaged_table(content: bytes) -> None:
     check_parquet(content)
 
 
+def test_an_empty_table_is_read(tmp_path: Path) -> None:
+    empty = pd.DataFrame({"x": np.empty(0), "condition": np.empty(0, str)})
+    write_table(empty, tmp_path / "t.parquet", units=PHYSICAL)
+    assert list(read_table(tmp_path / "t.parquet")[0].columns) == ["x", "condition"]
+
+
 def with_rows(rows: int) -> bytes:
     """A valid table whose footer promises `rows` rows, in the file and in its row group."""
     content = table(2)
