@@ -16,8 +16,8 @@ PILOTS = 3  # scenes tried of each group that differs in phi, v0, eta and the li
 # What decides the cost of a step beside the state of the layer.
 _KIND = ("cells", "modes", "contact", "points", "integrator", "dt", "tolerance")
 # Memory of a worker beside its tables, and of the tables: measured, see docs/scale.md.
-BASE_MEMORY = 330e6
-BYTES_PER_CELL_AND_FRAME = 560.0
+BASE_MEMORY = 345e6
+BYTES_PER_CELL_AND_FRAME = 350.0
 
 Progress = Callable[[int, int], None]
 
