@@ -52,7 +52,7 @@ def write_study(
         write_table(stacks, path, units=units)
     times = relaxation_times(tasks)
     if times is None:  # nor may those of another configuration stay
-        for name in ("relaxation_times.parquet", "statistics.json"):
+        for name in ("relaxation_times.parquet", "trial_values.parquet", "statistics.json"):
             (folder / name).unlink(missing_ok=True)
     else:
         with atomic_path(folder / "relaxation_times.parquet") as path:
