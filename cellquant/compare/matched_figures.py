@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 MAX_CURVES = 6
 MAX_PICTURES = 3
+MAX_PATH_POINTS = 2500
 SQUARE = 8.0  # mean diameters, edge of the enlarged part of the trajectories
 Measure = Callable[[Group, int], list[Curve]]
 
@@ -198,7 +199,7 @@ def path_figures(groups: Sequence[Group]) -> list[Figure]:
             ("whole", recent, (low[0], high[0], low[1], high[1])),
             ("close", near, square),
         ):
-            paths = thin_paths(chosen, max_points=5000)
+            paths = thin_paths(chosen, max_points=MAX_PATH_POINTS)
             if paths.empty:
                 continue
             name = f"paths-{view}-{index + 1}"
@@ -207,13 +208,14 @@ def path_figures(groups: Sequence[Group]) -> list[Figure]:
             shown = "in the marked square" if view == "close" else "in view"
             words = f"Paths of the cells of {group.name} {shown}, over {span}."
             views[view].append(Panel(name, svg, words, group.name))
-            data[view].append(paths.assign(result=group.name))
+            # Short rows: these are the longest tables of the page.
+            data[view].append(paths.round({"x": 3, "y": 3}).assign(drawing=len(views[view])))
     captions = {
         "whole": (
             "Trajectories",
             "The last two relaxation times, or the whole recording where τ_{α} is not known or the "
             "recording is shorter. Dots mark where the paths end; lengths are in mean cell "
-            "diameters d. The marked square is enlarged below.",
+            "diameters d. The marked square is enlarged below. The numbers count the drawings from 1.",
         ),
         "close": (
             "Trajectories, enlarged to the same scale",
