@@ -215,7 +215,7 @@ def path_figures(groups: Sequence[Group]) -> list[Figure]:
             "Trajectories",
             "The last two relaxation times, or the whole recording where τ_{α} is not known or the "
             "recording is shorter. Dots mark where the paths end; lengths are in mean cell "
-            "diameters d. The marked square is enlarged below. The numbers count the drawings from 1.",
+            "diameters d. The marked square is enlarged below. In the CSV, drawing counts from 1.",
         ),
         "close": (
             "Trajectories, enlarged to the same scale",

@@ -78,7 +78,9 @@ def _masks_of(record: Mapping[str, Any], folder: Path) -> "LabelStack | None":
     named = [settings.get("masks"), *record.get("inputs", {})]
     calibration = settings.get("calibration", settings)
     for path in [Path(name) for name in named if isinstance(name, str)]:
-        for place in (path, folder / path.name):
+        # A path as given may be relative to where the study was made, above its results.
+        above = [] if path.is_absolute() else [one / path for one in folder.resolve().parents[:6]]
+        for place in (path, folder / path.name, *above):
             if not place.exists() or place.suffix in {".parquet", ".toml", ".json", ".zarr"}:
                 continue
             try:
