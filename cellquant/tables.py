@@ -302,8 +302,6 @@ def read_table(
         arrow = decode_texts(path, pq.read_table(path, columns=wanted, read_dictionary=texts))
         # Each column is freed as soon as it is converted, or the table would be held twice.
         table = arrow.to_pandas(split_blocks=True, self_destruct=True)
-        del arrow
-        pa.default_memory_pool().release_unused()
     except KeyError as error:
         raise InputError(
             f"{path} carries no {error} in its schema metadata, so its numbers have no unit; "

@@ -83,17 +83,6 @@ def test_triangular_lattice() -> None:
     assert g["distance"][g["value"].idxmax()] == pytest.approx(1, abs=0.05)
 
 
-@pytest.mark.parametrize("diameter", [1.0, 0.4])
-def test_first_peak_is_that_of_the_spacing_also_where_cells_leave_gaps(diameter: float) -> None:
-    """A loosely ordered layer of spacing 1: nuclei of any size do not move its peak."""
-    rng = np.random.default_rng(5)
-    side = np.arange(24.0)
-    place = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 1, 2)
-    place = np.repeat(place, 12, axis=1) + rng.normal(0, 0.12, (place.shape[0], 12, 2))
-    found = structure_factor(tracks_of(place, box=(24.0, 24.0)), diameter=diameter).peak
-    assert found["q_peak"] == pytest.approx(2 * np.pi, rel=0.03)
-
-
 def test_global_order_of_random_points_is_small() -> None:
     order = bond_order(gas(np.random.default_rng(4), n=400, frames=8))
     assert order.summary["global"] < 0.1

@@ -104,6 +104,21 @@ def test_threads_do_not_change_the_run(tmp_path):
     same(open_run(tmp_path / "1.zarr"), open_run(tmp_path / "2.zarr"))
 
 
+def test_steps_without_linear_algebra_resume_bitwise(tmp_path, monkeypatch):
+    """The stiffness seen last is no part of the checkpoint."""
+    scene = Scene(n_cells=16)
+    whole = simulate(scene, duration=0.6, dt=0.005, save_every=0.2)
+    monkeypatch.setattr(run_module, "CHECKPOINT_EVERY", 0.0)
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    path = tmp_path / "run.zarr"
+    with pytest.raises(KeyboardInterrupt):
+        simulate(scene, duration=0.6, dt=0.005, save_every=0.2, output=path, progress=stop)
+    same(whole, simulate(scene, duration=0.6, dt=0.005, save_every=0.2, output=path))
+
+
 def test_other_settings_are_not_mixed_into_a_run(tmp_path):
     simulate(SMALL, duration=1, dt=0.02, output=tmp_path / "run.zarr")
     with pytest.raises(InputError, match="another v0"):

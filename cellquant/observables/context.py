@@ -100,8 +100,6 @@ class Context:
         tracks = self.tracks
         if not self.settings.keep_cut_cells:
             tracks = leave_out_cut_cells(tracks)
-        # What else the table holds would be copied at every step from here on.
-        tracks = replace(tracks, table=tracks.table[["track_id", "frame", "x", "y"]])
         if self.settings.drift:
             tracks = remove_drift(tracks)
         return retain(tracks, self.settings.min_points)

@@ -165,7 +165,7 @@ class SpatialCorrelation:
     table
         distance, value, std_error, n_pairs.
     summary
-        correlation_length (1/e crossing) with its error, or None with a reason.
+        correlation_length (1/e crossing) or None with a reason.
     """
 
     table: pd.DataFrame
@@ -235,42 +235,23 @@ def velocity_correlation(
             "n_pairs": np.rint(counts.sum(axis=0)).astype(np.int64),
         }
     )
-    found = _correlation_length(table, moved=bool(square[:, 0].sum() > 0))
-    if found["correlation_length"] is not None:
-        seen = table["n_pairs"].to_numpy() > 0
-        r = table["distance"].to_numpy()[seen]
-        lengths = np.array([_falls_to(r, curve[seen]) for curve in rest])
-        error = float(jackknife_error(lengths))
-        found.update(correlation_length_std_error=error, std_error_method=blocks.method)
-        if not np.isfinite(error):
-            found["reason"] = (
-                f"without some block the correlation does not cross 1/e up to {r[-1]:g}, so the "
-                "error of its length is open"
-            )
-    return SpatialCorrelation(table, found)
-
-
-def _falls_to(r: FloatArray, c: FloatArray, level: float = float(np.exp(-1))) -> float:
-    """Distance at which a curve first falls through the level, interpolated linearly; else NaN."""
-    below = np.flatnonzero((c[1:] < level) & (c[:-1] >= level))
-    if not below.size:
-        return float("nan")
-    k = int(below[0]) + 1
-    share = (c[k - 1] - level) / (c[k - 1] - c[k])
-    return float(r[k - 1] + share * (r[k] - r[k - 1]))
+    return SpatialCorrelation(table, _correlation_length(table, moved=bool(square[:, 0].sum() > 0)))
 
 
 def _correlation_length(table: pd.DataFrame, *, moved: bool) -> dict[str, Any]:
     known = table[table["n_pairs"] > 0]
-    none: dict[str, Any] = {"correlation_length": None, "correlation_length_std_error": None}
+    none: dict[str, Any] = {"correlation_length": None}
     if not moved or not len(known):
         return {**none, "reason": "no cell moved" if len(known) else "no two cells in one frame"}
     r, c = known["distance"].to_numpy(), known["value"].to_numpy()
-    if not (c < np.exp(-1)).any():
+    low = np.flatnonzero(c < np.exp(-1))
+    if not low.size:
         return {**none, "reason": f"the correlation stays above 1/e up to {r[-1]:g}"}
-    if c[0] < np.exp(-1):
+    k = int(low[0])
+    if k == 0:
         return {**none, "reason": f"the correlation is below 1/e at {r[0]:g} already"}
-    return {"correlation_length": _falls_to(r, c)}
+    share = (c[k - 1] - np.exp(-1)) / (c[k - 1] - c[k])
+    return {"correlation_length": float(r[k - 1] + share * (r[k] - r[k - 1]))}
 
 
 def cage_relative(

@@ -36,13 +36,11 @@ def ordered_rows(table: pd.DataFrame) -> pd.DataFrame:
         If a track has two rows in one frame.
     """
     track, frame = table["track_id"].to_numpy(), table["frame"].to_numpy()
-    same = track[1:] == track[:-1]
-    if not ((track[1:] > track[:-1]) | (same & (frame[1:] >= frame[:-1]))).all():
-        order = np.lexsort((frame, track))
+    order = np.lexsort((frame, track))
+    if not np.array_equal(order, np.arange(order.size)):
         table = table.iloc[order]
         track, frame = track[order], frame[order]
-        same = track[1:] == track[:-1]
-    twice = same & (frame[1:] == frame[:-1])
+    twice = (track[1:] == track[:-1]) & (frame[1:] == frame[:-1])
     if twice.any():
         row = int(np.flatnonzero(twice)[0])
         raise InputError(
@@ -107,7 +105,7 @@ def leave_out_cut_cells(tracks: Tracks) -> Tracks:
     whole = ~tracks.table["touches_border"].to_numpy(dtype=bool)
     return replace(
         tracks,
-        table=tracks.table if whole.all() else tracks.table[whole],
+        table=tracks.table[whole],
         provenance={**tracks.provenance, "cut_cells_left_out": int(np.sum(~whole))},
     )
 
@@ -149,8 +147,8 @@ def smooth_tracks(tracks: Tracks, points: int = 5) -> Tracks:
     table = ordered_rows(tracks.table)
     track, frame, x, y, finite = _arrays(table)
     position, length = _segments(track, frame, finite)
-    half = np.clip(np.minimum(position, length - 1 - position), 0, (points - 1) // 2)
-    del position, length
+    half = np.minimum(np.minimum(position, length - 1 - position), (points - 1) // 2)
+    half = np.maximum(half, 0)
     smooth_x, smooth_y = x.copy(), y.copy()
     for offset in range(1, (points - 1) // 2 + 1):
         rows = np.flatnonzero(half >= offset)
@@ -183,31 +181,25 @@ def remove_drift(tracks: Tracks) -> Tracks:
     """
     table = ordered_rows(tracks.table)
     track, frame, x, y, finite = _arrays(table)
-    # All rows without copying any when every position is known, as in most tables.
-    rows = slice(None) if finite.all() else np.flatnonzero(finite)
-    present, index = _ranks(frame[rows])
+    rows = np.flatnonzero(finite)
+    present, index = np.unique(frame[rows], return_inverse=True)
     same = (track[rows][1:] == track[rows][:-1]) & (np.diff(index) == 1)
     step = index[1:][same]
-    count = np.bincount(step, minlength=present)
+    count = np.bincount(step, minlength=present.size)
     trusted = count >= MIN_DRIFT_CELLS
-    for values in (x, y):
-        total = np.bincount(step, weights=np.diff(values[rows])[same], minlength=present)
-        shift = np.cumsum(np.where(trusted, total / np.maximum(count, 1), 0.0))
-        values[rows] -= shift[index]
+    shift = np.zeros((2, present.size))
+    for axis, values in enumerate((x[rows], y[rows])):
+        total = np.bincount(step, weights=np.diff(values)[same], minlength=present.size)
+        shift[axis] = np.cumsum(np.where(trusted, total / np.maximum(count, 1), 0.0))
+    x[rows] -= shift[0, index]
+    y[rows] -= shift[1, index]
     kept = int(np.sum(~trusted[1:]))
-    drift = {"removed": kept < present - 1, "steps_kept": kept, "min_cells": MIN_DRIFT_CELLS}
+    drift = {"removed": kept < present.size - 1, "steps_kept": kept, "min_cells": MIN_DRIFT_CELLS}
     return replace(
         tracks,
         table=table.assign(x=x, y=y),
         provenance={**tracks.provenance, "drift": drift},
     )
-
-
-def _ranks(frame: IntArray) -> tuple[int, IntArray]:
-    """Number of different frames, and the rank of each among them, without a sort."""
-    first = int(frame.min()) if frame.size else 0
-    seen = np.bincount(frame - first) > 0
-    return int(seen.sum()), (np.cumsum(seen) - 1)[frame - first]
 
 
 def longest_runs(table: pd.DataFrame) -> pd.Series:
@@ -255,9 +247,6 @@ def retain(tracks: Tracks, min_points: int = 24) -> Tracks:
         raise ValueError(f"min_points must be >= 1, got {min_points}")
     table = ordered_rows(tracks.table)
     runs = longest_runs(table)
-    long = runs.to_numpy() >= min_points
-    if long.all():
-        return replace(tracks, table=table)
-    kept = runs.index[long]
+    kept = runs.index[runs.to_numpy() >= min_points]
     table = table[table["track_id"].isin(kept)].reset_index(drop=True)
     return replace(tracks, table=table)

@@ -115,8 +115,7 @@ def structure_factor(
     source
         Tracks or cells.
     diameter
-        Mean cell diameter d, to place the search for the first peak: from 0.6 times the smaller of
-        2 pi/d and 2 pi sqrt(density) to 1.6 times 2 pi/d; from the density when None.
+        Mean cell diameter, to place the search for the first peak; from the density when None.
     max_frames
         Frames used, evenly spaced.
     max_wave_number
@@ -159,14 +158,10 @@ def structure_factor(
     q = np.hypot(*np.meshgrid(q_x, q_y, indexing="ij"))
     # One of each pair q, -q; on the line q_x = 0 that is q_y > 0.
     half = (q > 0) & (q <= limit) & ~((q_x[:, None] == 0) & (q_y[None, :] < 0))
-    # Centres of cells that leave gaps are spaced by their density, not by their diameter.
-    spaced = 2 * np.pi * np.sqrt(density)
-    return _shells(q[half], power[half], float(step.max()), min(scale, spaced), scale)
+    return _shells(q[half], power[half], float(step.max()), scale)
 
 
-def _shells(
-    q: FloatArray, power: FloatArray, width: float, low: float, high: float
-) -> StructureFactor:
+def _shells(q: FloatArray, power: FloatArray, width: float, scale: float) -> StructureFactor:
     shell = np.floor(q / width - 0.5).astype(np.int64)
     n_shells = int(shell.max()) + 1
     # Vectors below half a width, if the rectangle is elongated, join the first shell.
@@ -188,7 +183,7 @@ def _shells(
     table = pd.DataFrame(
         {"wave_number": mean_q, "value": value, "std_error": error, "n_vectors": n.astype(np.int64)}
     )
-    return StructureFactor(table, _first_peak(mean_q, value, error, sums, counts, low, high))
+    return StructureFactor(table, _first_peak(mean_q, value, error, sums, counts, scale))
 
 
 def _first_peak(
@@ -197,20 +192,16 @@ def _first_peak(
     error: FloatArray,
     sums: FloatArray,
     counts: FloatArray,
-    low: float,
-    high: float,
+    scale: float,
 ) -> dict[str, Any]:
-    """Largest S(q) from 0.6 times low to 1.6 times high, refined by a parabola around it."""
+    """Largest S(q) between 0.6 and 1.6 of the scale, refined by a parabola around it."""
     none: dict[str, Any] = {"q_peak": None, "q_peak_std_error": None}
-    window = (q >= 0.6 * low) & (q <= 1.6 * high)
+    window = (q >= 0.6 * scale) & (q <= 1.6 * scale)
     if window.sum() < 3:
         return {**none, "reason": "fewer than three shells lie where the first peak is expected"}
     k = int(np.flatnonzero(window)[np.argmax(value[window])])
     if k in (np.flatnonzero(window)[0], np.flatnonzero(window)[-1]):
-        return {
-            **none,
-            "reason": f"S(q) has no maximum between {0.6 * low:.3g} and {1.6 * high:.3g}",
-        }
+        return {**none, "reason": "S(q) has no maximum between 0.6 and 1.6 times 2 pi/d"}
     # |sum exp(-i q r)|^2/N of independent points is exponential with mean and spread 1; of a
     # crystal it differs so much between the vectors of a shell that only this bound is of use.
     scatter = 1 / np.sqrt(counts[:, k].sum())

@@ -89,23 +89,18 @@ def from_tracks(tracks: Tracks) -> Trajectories:
     track = table["track_id"].to_numpy(dtype=np.int64)
     frame = table["frame"].to_numpy(dtype=np.int64)
     finite = np.isfinite(x) & np.isfinite(y)
-    if not finite.all():
-        x, y, track, frame = x[finite], y[finite], track[finite], frame[finite]
+    x, y, track, frame = x[finite], y[finite], track[finite], frame[finite]
     starts = np.flatnonzero(np.r_[True, track[1:] != track[:-1]]) if track.size else track[:0]
     stops = np.r_[starts[1:], track.size] if track.size else starts
     first, last = frame[starts], frame[stops - 1]
     offsets = np.r_[0, np.cumsum(last - first + 1)].astype(np.int64)
     row = np.repeat(np.arange(starts.size), stops - starts)
-    entry = (offsets[:-1] - first)[row]
-    entry += frame
-    layout = {}
-    for name, values in (("x", x), ("y", y)):
-        layout[name] = np.zeros(int(offsets[-1]))
-        layout[name][entry] = values
-        layout[name][entry] -= values[starts][row]
+    entry = offsets[row] + frame - first[row]
+    layout = {name: np.zeros(int(offsets[-1])) for name in ("x", "y")}
+    layout["x"][entry] = x - x[starts][row]
+    layout["y"][entry] = y - y[starts][row]
     valid = np.zeros(int(offsets[-1]), dtype=bool)
     valid[entry] = True
-    del entry
     size = np.maximum(stops - starts, 1)
     centre = np.column_stack(
         [np.bincount(row, weights=v, minlength=starts.size) / size for v in (x, y)]

@@ -26,7 +26,7 @@ from cellquant.sim.contacts import Layer
 from cellquant.sim.kernels import HEAD
 
 Floats = NDArray[np.float64]
-CG_TOLERANCE = 3e-2
+CG_TOLERANCE = 1e-2
 CG_MOST = 200
 LEAST_SINE = 0.05  # smaller angles, of grazing contacts, would only cost iterations
 FLAGS = {"contract", "reassoc", "nsz", "arcp"}
