@@ -323,11 +323,17 @@ class StiffPart:
                 return
             self._allocate(self._count + self._count // 4)
 
-    def solve(self, state: Floats, right: Floats, g: float, diagonal: Any, out: Floats) -> None:
-        """Solve (1 + diagonal + g M H) out = right to CG_TOLERANCE; `state` as when collected."""
+    def solve(
+        self, state: Floats, right: Floats, g: float, diagonal: Any, out: Floats,
+        *, share: float = 1.0,
+    ) -> None:  # fmt: skip
+        """Solve (1 + diagonal + g M H) out = right; `state` as when collected.
+
+        The residual is at most `share` CG_TOLERANCE of the right-hand side.
+        """
         self.iterations += solve(
             state, right, self._scale, self._count, self._weight, self._factor, self._cells,
-            diagonal, g, self._modes, CG_TOLERANCE, CG_MOST, self._work, out,
+            diagonal, g, self._modes, max(share * CG_TOLERANCE, 1e-6), CG_MOST, self._work, out,
         )  # fmt: skip
 
     def _allocate(self, room: int) -> None:
