@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cellquant.errors import InputError
-from cellquant.parquet import check_promises, decode_texts, text_columns
 
 CELL_COLUMNS: Mapping[str, str] = {
     "frame": "int64",
@@ -287,7 +286,7 @@ def read_table(
     if not path.is_file():
         raise InputError(f"{path} does not exist; give the path of a parquet table.")
     try:
-        schema = check_promises(path)
+        schema = pq.read_schema(path)
         raw = schema.metadata or {}
         units = Units(raw[b"length_unit"].decode(), raw[b"time_unit"].decode())
         metadata = json.loads(raw[b"cellquant"])
@@ -297,9 +296,7 @@ def read_table(
                 f"{path} is not a {kind} table: it lacks the columns {', '.join(missing)}; "
                 "make one with 'cellquant track MASKS -o DIR'."
             )
-        wanted = list(schema.names if columns is None else columns)
-        texts = [name for name in text_columns(schema) if name in wanted]
-        arrow = decode_texts(path, pq.read_table(path, columns=wanted, read_dictionary=texts))
+        arrow = pq.read_table(path, columns=None if columns is None else list(columns))
         # Each column is freed as soon as it is converted, or the table would be held twice.
         table = arrow.to_pandas(split_blocks=True, self_destruct=True)
     except KeyError as error:
@@ -307,11 +304,9 @@ def read_table(
             f"{path} carries no {error} in its schema metadata, so its numbers have no unit; "
             "use a table written by cellquant."
         ) from error
-    except InputError:
-        raise
-    except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:300]
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(
-            f"{path} is not a readable parquet table ({reason}); make it again from its source."
+            f"{path} is not a readable parquet table ({str(error).splitlines()[0]}); "
+            "make it again from its source."
         ) from error
     return table, units, metadata

@@ -1,24 +1,26 @@
 """The layer at work: buffers, neighbour list and the choice of the compiled contact rule."""
 
-import math
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cellquant.errors import InputError
-from cellquant.sim import kernels, pinches
+from cellquant.sim import (
+    crossings,
+    discs,
+    neighbours,
+    outlines,
+    overlaps,
+    pinches,
+    quadrature,
+)
 from cellquant.sim.scene import Scene, SimulationFailure
 
 Floats = NDArray[np.float64]
 ContactRule = Literal["exact", "quadrature"]
 NONE = np.empty(0, np.int64)
 PINCHED = 0.02  # smallest sample of a contour over R0 below which its zeros are sought
-
-
-def exact_samples(modes: int) -> int:
-    """Samples of a contour from which the exact rule starts its search, a multiple of 8."""
-    return 8 * max(6, modes)
 
 
 class Layer:
@@ -77,20 +79,23 @@ class Layer:
         self._numbers = np.array(
             [scene.v0, scene.k, scene.eta, scene.mu_r, scene.mu_theta, scene.mu_ab], np.float64
         )
-        size = exact_samples(scene.modes) if contact == "exact" else points
-        angle = 2.0 * math.pi * np.arange(size) / size
-        rows = [f(n * angle) for n in range(1, max(scene.modes, 1) + 1) for f in (np.cos, np.sin)]
-        self._table = np.ascontiguousarray(rows)
-        self._record = np.zeros((n_cells, kernels.HEAD + 2 * n_modes))
-        self._rho = np.zeros((n_cells, size))
-        self._slope = np.zeros((n_cells, size))
-        self._tangent = np.zeros((n_cells, 2 + 2 * n_modes))
-        self._lowest = self.radius.copy()
+        size = outlines.samples_of(scene.modes) if contact == "exact" else points
+        self._table, single = outlines.compass(scene.modes, size)
+        self._record = np.zeros((n_cells, outlines.HEAD + 2 * n_modes))
         self._energy = np.zeros(n_cells)
+        if contact == "exact":
+            self._single = single
+            self._quarter, self._starts = outlines.quarter_points(scene.modes)
+            self._grid = np.zeros((n_cells, 3, 3 * size // 2), np.float32)
+            self._pattern = np.zeros((n_cells, 1 + 2 * n_modes), np.float32)
+            self._tangent = np.zeros((n_cells, 2 + 2 * n_modes))
+        else:
+            self._rho = np.zeros((n_cells, size))
+            self._slope = np.zeros((n_cells, size))
         self._reference: Floats | None = None
         self._capacity = 6 * n_cells + 64
-        self._n_blocks = -(-n_cells // kernels.BLOCK)
-        self._allocate_roots(12 * kernels.BLOCK)
+        self._n_blocks = -(-n_cells // outlines.BLOCK)
+        self._allocate_roots(12 * outlines.BLOCK)
 
     def velocity(self, state: Floats, out: Floats) -> None:
         """Write the deterministic part of d(state)/dt into `out`.
@@ -112,12 +117,12 @@ class Layer:
         common = (self._first, self._other, self._shift)
         back = (self._back_first, self._back_pair, self._back_cell)
         if self.scene.rigid:
-            kernels.rigid_velocity(
+            discs.rigid_velocity(
                 state, self.radius, *common, *back, self._numbers, out, self._energy
             )
         elif self.contact == "exact":
             self._find_crossings()
-            kernels.exact_velocity(
+            overlaps.exact_velocity(
                 state,
                 self.radius,
                 self._record,
@@ -138,11 +143,10 @@ class Layer:
                 self._energy,
             )
         else:
-            kernels.quadrature_velocity(
+            quadrature.quadrature_velocity(
                 state,
                 self.radius,
                 self._record,
-                self._lowest,
                 self._rho,
                 self._slope,
                 self._table,
@@ -188,33 +192,43 @@ class Layer:
 
     def restore_list(self, reference: Floats) -> None:
         """Make the neighbour list as it was, so that sums keep their order after a restart."""
-        self._record[:, [0, 1, 3]] = reference[:, :3]
-        self._lowest[:] = reference[:, 3]
+        self._record[:, [0, 1, 3, 4]] = reference
         self._rebuild()
 
     def _prepare(self, state: Floats, tension: tuple[int, ...]) -> None:
         if self.scene.rigid:
             self._record[:, :2] = state[:, :2]
-            self._record[:, 2] = self._record[:, 3] = self.radius
+            self._record[:, 2:5] = self.radius[:, None]
+        elif self.contact == "exact":
+            outlines.contours(
+                state,
+                self.radius,
+                self._single,
+                self._quarter,
+                self._starts,
+                self._modes,
+                tension,
+                self._record,
+                self._grid,
+                self._pattern,
+                self._tangent,
+            )
         else:
-            kernels.contours(
+            quadrature.sample_contours(
                 state,
                 self.radius,
                 self._table,
                 self._modes,
-                tension,
                 self._record,
                 self._rho,
                 self._slope,
-                self._tangent,
-                self._lowest,
             )
         fresh = self._reference is None
         reference = self._record[:, [0, 1, 3]] if self._reference is None else self._reference
-        age, fault, narrowest = kernels.inspect(self._record, self._lowest, reference)
+        age, fault, narrowest = neighbours.inspect(self._record, reference)
         self._check(fault)
         self._narrow = (
-            np.flatnonzero(self._lowest < pinches.NARROW * self.radius)
+            np.flatnonzero(self._record[:, 4] < pinches.NARROW * self.radius)
             if narrowest < 2.0 * pinches.NARROW and not self.scene.rigid
             else NONE
         )
@@ -229,7 +243,7 @@ class Layer:
         row = self._record[fault]
         reason = "the state is not finite"
         remedy = "take a smaller step or the adaptive integrator"
-        if np.isfinite(row[:2]).all() and np.isfinite(row[kernels.HEAD :]).all():
+        if np.isfinite(row[:2]).all() and np.isfinite(row[outlines.HEAD :]).all():
             reason = "the contour is no longer representable (a0^2 <= 0)"
             remedy = "the cell is drawn out too far: take a larger eta, or a smaller v0 or phi"
         raise SimulationFailure(reason, remedy, cell=fault)
@@ -238,7 +252,7 @@ class Layer:
         position = np.ascontiguousarray(self._record[:, :2])
         reach = np.ascontiguousarray(self._record[:, 3])
         while True:
-            first, other, shift, needed = kernels.find_pairs(
+            first, other, shift, needed = neighbours.find_pairs(
                 position, reach, self.box, self.skin, self._capacity
             )
             if needed[0] <= self._capacity:
@@ -251,17 +265,17 @@ class Layer:
             self._capacity = int(needed[0])
         self._first, self._other, self._shift = first, other.copy(), shift.copy()
         self._put_narrow_first()
-        back = kernels.transpose_pairs(self._first, self._other)
+        back = neighbours.transpose_pairs(self._first, self._other)
         self._back_first, self._back_pair, self._back_cell = back
         self._root_first = np.zeros(len(self._other), np.int64)
         self._root_last = np.zeros(len(self._other), np.int64)
         self._inside = np.zeros(len(self._other), np.int8)
-        self._reference = np.column_stack([self._record[:, [0, 1, 3]], self._lowest])
+        self._reference = np.ascontiguousarray(self._record[:, [0, 1, 3, 4]])
         self.builds += 1
 
     def _put_narrow_first(self) -> None:
         """Turn the listed pairs so that crossings are sought on the contour with the waist."""
-        waist = self._lowest / self.radius
+        waist = self._record[:, 4] / self.radius
         if not waist.min() < pinches.NARROW:
             return
         waist[waist > pinches.NARROW] = 1.0
@@ -276,17 +290,16 @@ class Layer:
 
     def _allocate_roots(self, room: int, spare: int = 0) -> None:
         self._room = self._n_blocks * room
-        self._roots = np.zeros((self._room + spare, kernels.ROOT))
+        self._roots = np.zeros((self._room + spare, crossings.ROOT))
         self._sign = np.zeros(self._room + spare)
 
     def _find_crossings(self) -> None:
         while True:
             fault: Any = np.zeros(self._n_blocks, np.int64)
-            kernels.crossings(
+            crossings.crossings(
                 self._record,
-                self._lowest,
-                self._rho,
-                self._slope,
+                self._grid,
+                self._pattern,
                 self._table,
                 self._first,
                 self._other,
@@ -308,7 +321,7 @@ class Layer:
 
     def _close_pinches(self) -> int:
         """End the arcs of pinched contours where they reach the centre; return the room used."""
-        pinched = self._lowest < PINCHED * self.radius
+        pinched = self._record[:, 4] < PINCHED * self.radius
         if len(self._narrow) == 0 or not pinched.any():
             return 0
         return int(

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from cellquant.sim.kernels import HEAD, ROOT
+from cellquant.sim.crossings import ROOT
+from cellquant.sim.outlines import HEAD
 
 NARROW = 0.3  # radius over R0 below which the contour's length needs more points, and the
 # crossings are sought on this contour: its own radius varies fast with the direction
@@ -208,7 +209,7 @@ def add_gaps(
 
 @njit(cache=True, error_model="numpy")
 def measure_lengths(record: Any, cells: Any, n_modes: int, tangent: Any) -> None:
-    """Length of some contours and their gradients (see `kernels.contours`) on graded panels.
+    """Length of some contours and their gradients (see `outlines.contours`) on graded panels.
 
     The integrand is as smooth as its smallest tangent is long; panels are halved until they are
     shorter than their distance from the place where the tangent could vanish.

@@ -23,7 +23,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from cellquant.sim.contacts import Layer
-from cellquant.sim.kernels import HEAD
+from cellquant.sim.outlines import HEAD
 
 Floats = NDArray[np.float64]
 CG_TOLERANCE = 1e-2

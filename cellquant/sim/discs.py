@@ -1,0 +1,63 @@
+"""Rigid discs: scenes without shape modes."""
+
+import math
+from typing import Any
+
+from numba import njit, prange
+
+FLAGS = {"contract", "nsz", "arcp", "reassoc"}
+
+
+@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
+def rigid_velocity(
+    state: Any,
+    radius: Any,
+    first: Any,
+    other: Any,
+    shift: Any,
+    back_first: Any,
+    back_pair: Any,
+    back_cell: Any,
+    numbers: Any,
+    velocity: Any,
+    energy: Any,
+) -> None:
+    """Velocity and energy of rigid discs: the overlap of two circles is known in closed form."""
+    v0, k, eta, mu_r = numbers[0], numbers[1], numbers[2], numbers[3]
+    for i in prange(state.shape[0]):
+        fx = 0.0
+        fy = 0.0
+        area = 0.0
+        n_own = first[i + 1] - first[i]
+        n_all = n_own + back_first[i + 1] - back_first[i]
+        for entry in range(n_all):
+            if entry < n_own:
+                p = first[i] + entry
+                j = other[p]
+                side = 1.0
+            else:
+                p = back_pair[back_first[i] + entry - n_own]
+                j = back_cell[back_first[i] + entry - n_own]
+                side = -1.0
+            dx = state[j, 0] + side * shift[p, 0] - state[i, 0]
+            dy = state[j, 1] + side * shift[p, 1] - state[i, 1]
+            square = dx * dx + dy * dy
+            ri = radius[i]
+            rj = radius[j]
+            if square >= (ri + rj) * (ri + rj):
+                continue
+            if square <= (ri - rj) * (ri - rj):
+                area += 0.5 * math.pi * min(ri, rj) ** 2
+                continue
+            distance = math.sqrt(square)
+            along = 0.5 * (square + ri * ri - rj * rj) / distance
+            chord = 2.0 * math.sqrt(max(0.0, ri * ri - along * along))
+            fx += chord * dx / distance
+            fy += chord * dy / distance
+            angle_i = math.acos(max(-1.0, min(1.0, along / ri)))
+            angle_j = math.acos(max(-1.0, min(1.0, (distance - along) / rj)))
+            area += 0.5 * (ri * ri * angle_i + rj * rj * angle_j - 0.5 * distance * chord)
+        velocity[i, 0] = v0 * math.cos(state[i, 2]) - mu_r * k * fx
+        velocity[i, 1] = v0 * math.sin(state[i, 2]) - mu_r * k * fy
+        velocity[i, 2] = 0.0
+        energy[i] = k * area + 2.0 * math.pi * eta * radius[i]
