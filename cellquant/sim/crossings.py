@@ -367,10 +367,11 @@ def judge_gaps(gaps: Any, filled: int, modes: Any, kind: Any, guess: Any, curve:
 
     With the samples beyond both ends the interpolation is of degree 7: the cubic p(t) through the
     ends plus t^2 (t - 1)^2 q(t), q cubic. `guess` takes the positions of the first and the second
-    crossing in units of the width, in rows GAPS apart, and `curve` the second derivatives there.
+    crossing and of an extremum between them in units of the width, in rows GAPS apart, and `curve`
+    the second derivatives at the crossings.
     """
     kinds = carray(integers(modes, 1, 0), (LANES,))
-    places = carray(singles(modes, 4, 0), (4 * LANES,))
+    places = carray(singles(modes, 5, 0), (5 * LANES,))
     row = np.uint64(GAPS)
     for begin in range(np.uint64(0), np.uint64(filled), np.uint64(LANES)):
         for r in range(np.uint64(LANES)):
@@ -452,9 +453,11 @@ def judge_gaps(gaps: Any, filled: int, modes: Any, kind: Any, guess: Any, curve:
             t = cubic_step(t, low, high, g0, e0, c2, c3)
             t = full_step(t, low, high, g0, e0, c2, c3, q0, q1, q2, q3)
             t = full_step(t, low, high, g0, e0, c2, c3, q0, q1, q2, q3)
+            t = full_step(t, low, high, g0, e0, c2, c3, q0, q1, q2, q3)
             t = t if t < high else high
             t = t if t > low else low
             places[r] = t
+            places[np.uint64(4 * LANES) + r] = t1 if change_1 else t2
             places[np.uint64(2 * LANES) + r] = TWO_ * c2 + F(6.0) * c3 * t
             low = t1 if change_2 else ZERO
             low = t2 if change_3 else low
@@ -462,6 +465,7 @@ def judge_gaps(gaps: Any, filled: int, modes: Any, kind: Any, guess: Any, curve:
             high = ONE_ if change_3 else high
             t = start_in_piece(low, high, t2, p1, p2, g0, difference, c2, c3)
             t = cubic_step(t, low, high, g0, e0, c2, c3)
+            t = full_step(t, low, high, g0, e0, c2, c3, q0, q1, q2, q3)
             t = full_step(t, low, high, g0, e0, c2, c3, q0, q1, q2, q3)
             t = full_step(t, low, high, g0, e0, c2, c3, q0, q1, q2, q3)
             t = t if t < high else high
@@ -473,6 +477,7 @@ def judge_gaps(gaps: Any, filled: int, modes: Any, kind: Any, guess: Any, curve:
             kind[at] = kinds[r]
             guess[at] = places[r]
             guess[row + at] = places[LANES + r]
+            guess[row + row + at] = places[4 * LANES + r]
             curve[at] = places[2 * LANES + r]
             curve[row + at] = places[3 * LANES + r]
 
@@ -776,7 +781,7 @@ def crossings(
         gaps = np.empty(10 * GAPS, np.float32)
         marks = np.empty(GAPS, np.int32)
         kind = np.empty(GAPS, np.int32)
-        guess = np.empty(2 * GAPS, np.float32)
+        guess = np.empty(3 * GAPS, np.float32)
         curve = np.empty(2 * GAPS, np.float32)
         lane = np.empty(LINES * CHUNK)
         result = np.empty(8 * CHUNK)
@@ -845,7 +850,7 @@ def crossings(
                                 low = -1e-3
                                 high = 1.001
                                 if kind[q] == TWO:
-                                    middle = 0.5 * (guess[q] + guess[GAPS + q])
+                                    middle = guess[2 * GAPS + q]
                                     low = middle if side == 1 else low
                                     high = middle if side == 0 else high
                                 s = start[k] + marks[q]
