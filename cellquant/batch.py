@@ -1,8 +1,9 @@
 """A whole study: every stack of every trial of every condition, resumable and in parallel.
 
 Each stack is a task with a folder of its own. The folder's ``run.json`` is written last and holds
-the key of the work (configuration, version, digest of the input): a task whose key is there is not
-done again, and one whose configuration or input has changed is.
+the key of the work (configuration, code, digest of the input): a task whose key is there is not
+done again, and one whose configuration, code or input has changed is. Tracking has a key of its
+own, so that other observables are measured on the tracks that are there.
 """
 
 import glob
@@ -11,15 +12,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cellquant.config import ConditionConfig, ExperimentConfig, TrialConfig, load
-from cellquant.engines import BatchOutcome, Task, run_tasks
+from cellquant.engines import BatchOutcome, Task, check_code, run_tasks, share
 from cellquant.errors import InputError
+from cellquant.fingerprint import code_digest
+from cellquant.lock import LOCK, only_writer
 from cellquant.storage import (
+    FINISHED,
+    MANIFEST,
+    STARTED,
     RunRecord,
+    begin,
     check_output,
     content_key,
     digest,
+    earlier_record,
     finished_key,
-    only_writer,
+    make_folder,
+    remove_partial,
     write_json,
 )
 from cellquant.study import write_study
@@ -48,6 +57,8 @@ def find_stacks(config: ExperimentConfig, base: Path) -> list[Task]:
                 )
             names = [stack.stem for stack in stacks]
             for index, stack in enumerate(stacks):
+                if stack.stem.startswith("."):
+                    raise InputError(f"{stack} is a hidden file or folder; rename it.")
                 if names.count(stack.stem) > 1:
                     raise InputError(
                         f"trial {trial.name!r} of {condition.name!r} has two stacks named "
@@ -67,6 +78,12 @@ def find_stacks(config: ExperimentConfig, base: Path) -> list[Task]:
                     }
                 )
     return tasks
+
+
+def count_stacks(path: str | Path) -> int:
+    """Number of stacks of an experiment file."""
+    path = Path(path)
+    return len(find_stacks(load(path, ExperimentConfig), path.parent))
 
 
 def _matches(
@@ -90,15 +107,21 @@ def task_folder(out: Path, task: Task) -> Path:
 
 
 def work_on_stack(task: Task) -> None:
-    """Track and observe one stack, unless its finished result is there already."""
+    """Track and observe one stack, as far as that is not done already."""
+    check_code(task, "batch")
+    folder = make_folder(task["folder"])
+    with only_writer(folder, wait=True):
+        if finished_key(folder, "run") != task["key"]:
+            begin(folder, task["tracking_key"])
+            _track_and_observe(task, folder)
+
+
+def _track_and_observe(task: Task, folder: Path) -> None:
     from cellquant.compare.report import experiment_report
     from cellquant.io import read_images, read_labels
     from cellquant.pipeline import observe_into, track_movie
+    from cellquant.tables import read_cells, read_tracks
 
-    folder = Path(task["folder"])
-    if finished_key(folder, "run") == task["key"]:
-        return
-    shutil.rmtree(folder, ignore_errors=True)
     calibration = task["calibration"]
     masks = read_labels(
         task["masks"],
@@ -107,7 +130,16 @@ def work_on_stack(task: Task) -> None:
         units="pixel" if calibration["units"] == "pixel" else None,
     )
     raw = None if task["raw"] is None else read_images(task["raw"])
-    cells, tracks, record = track_movie(masks, folder, raw=raw, options=task["tracking"])
+    done = earlier_record(folder, "track", task["tracking_key"])
+    if done is None:
+        record = track_movie(
+            masks, folder, raw=raw, options=task["tracking"], key=task["tracking_key"]
+        )[2]
+    else:
+        record = RunRecord.from_dict(done)
+        _keep_tracks_only(folder, record)
+    # From the disk in either case, so that a resumed stack gives the same bytes.
+    cells, tracks = read_cells(folder), read_tracks(folder)
     observables = observe_into(
         tracks,
         folder,
@@ -134,12 +166,22 @@ def work_on_stack(task: Task) -> None:
     record.write(folder)
 
 
+def _keep_tracks_only(folder: Path, record: RunRecord) -> None:
+    """Remove what was measured on the tracks with another configuration."""
+    write_json(folder / MANIFEST, record.as_dict())
+    kept = {MANIFEST, STARTED, LOCK, "cells.parquet", "tracks.parquet"}
+    for entry in folder.iterdir():
+        if entry.name not in kept:
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+
+
 def run_experiment(
     path: str | Path,
     out: str | Path,
     *,
     workers: int = 1,
     scheduler: str | None = None,
+    part: str | None = None,
     progress: Progress | None = None,
 ) -> BatchOutcome:
     """Work through an experiment file: every stack, then the study's tables and report.
@@ -152,6 +194,9 @@ def run_experiment(
         Output folder; a folder of an earlier, interrupted or changed run is taken up again.
     workers, scheduler
         See `cellquant.engines.execute`.
+    part
+        ``"I/N"``: work on every N-th stack from number I on and leave the study's tables and
+        report to a last call without `part`. Several parts may be worked on at the same time.
     progress
         Called with (stacks finished, stacks in all).
 
@@ -163,21 +208,57 @@ def run_experiment(
     """
     path = Path(path)
     config = load(path, ExperimentConfig)
+    return run_config(
+        config,
+        path.parent,
+        out,
+        source=path,
+        workers=workers,
+        scheduler=scheduler,
+        part=part,
+        progress=progress,
+    )
+
+
+def run_config(
+    config: ExperimentConfig,
+    base: Path,
+    out: str | Path,
+    *,
+    source: Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    part: str | None = None,
+    progress: Progress | None = None,
+) -> BatchOutcome:
+    """Work through an experiment; as `run_experiment`, with the configuration already read.
+
+    Parameters
+    ----------
+    base
+        Folder at which relative paths start.
+    source
+        The file that the configuration was read from, for the record.
+    """
     folder = check_output(out)
-    tasks = find_stacks(config, path.parent)
-    record = RunRecord("run", config.model_dump())
-    record.add_input(path)
-    folder.mkdir(parents=True, exist_ok=True)
+    tasks = find_stacks(config, base)
+    record = RunRecord("run", {**config.model_dump(), "base": str(base.resolve())})
+    if source is not None:
+        record.add_input(source)
+    for task in share(tasks, part):
+        _add_keys(task, folder)
+    folder = make_folder(folder)
+    if part is not None:
+        return run_tasks(
+            work_on_stack,
+            share(tasks, part),
+            command="run",
+            workers=workers,
+            scheduler=scheduler,
+            on_finished=progress,
+        )
     with only_writer(folder):
-        for task in tasks:
-            task["key"] = content_key(
-                {
-                    "task": {k: v for k, v in task.items() if k not in {"masks", "raw"}},
-                    "masks": digest(task["masks"]),
-                    "raw": None if task["raw"] is None else digest(task["raw"]),
-                }
-            )
-            task["folder"] = str(task_folder(folder, task))
+        remove_partial(folder, below=False)
         with record.stage("stacks"):
             outcome = run_tasks(
                 work_on_stack,
@@ -190,9 +271,29 @@ def run_experiment(
         record.counts = {"stacks": len(tasks), "failed": len(outcome.failures)}
         record.notes = [f"{name}: {reason}" for name, reason in outcome.failures.items()]
         finished = [t for t in tasks if finished_key(Path(t["folder"]), "run") == t["key"]]
+        write_json(folder / FINISHED, [str(task_folder(Path(), t)) for t in finished])
         if finished:
             with record.stage("study"):
                 write_study(folder, finished, record.as_dict())
         write_json(folder / "failures.json", outcome.failures)
         record.write(folder)
     return outcome
+
+
+def _add_keys(task: Task, out: Path) -> None:
+    """Say what decides the result of a stack, and where it goes."""
+    named = {k: v for k, v in task.items() if k not in {"masks", "raw", "tracking", "calibration"}}
+    task["tracking_key"] = content_key(
+        {
+            "code": code_digest("pipeline"),
+            "calibration": task["calibration"],
+            "tracking": task["tracking"],
+            "masks": digest(task["masks"]),
+            "raw": None if task["raw"] is None else digest(task["raw"]),
+        }
+    )
+    task["code"] = code_digest("batch")
+    task["key"] = content_key(
+        {"code": task["code"], "tracking": task["tracking_key"], "task": named}
+    )
+    task["folder"] = str(task_folder(out, task))

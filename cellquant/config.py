@@ -4,6 +4,7 @@ Relative paths start at the file that names them. Unknown keys are refused, so t
 never falls back to a default in silence.
 """
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -12,10 +13,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cellquant.errors import InputError
 
+MAX_RUNS = 1_000_000
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[^/\\\x00-\x1f]+$")]
+Name = Annotated[
+    str, Field(min_length=1, max_length=80, pattern=r"^[^./\\\x00-\x1f][^/\\\x00-\x1f]*$")
+]
 
 
 class _Strict(BaseModel):
@@ -58,6 +62,25 @@ class ObservablesConfig(_Strict):
     core_range: tuple[NotNegative, Positive] | None = None
     tail_range: tuple[NotNegative, Positive] | None = None
     max_frames: Annotated[int, Field(ge=1)] = 32
+
+
+class RunObservablesConfig(_Strict):
+    """What is measured on each run of a sweep; what is left out is chosen as `observe` does."""
+
+    only: list[str] | None = None
+    smoothing: Annotated[int, Field(ge=1)] | None = None
+    min_points: Annotated[int, Field(ge=2)] | None = None
+    window: Annotated[int, Field(ge=2)] | None = None
+    drift: bool | None = None
+    wave_number: Positive | Literal["2pi/d", "structure_factor_peak"] | None = None
+    scattering: Literal["bessel", "vectors"] | None = None
+    lags: list[Annotated[int, Field(ge=1)]] | None = None
+    stride: Annotated[int, Field(ge=1)] | None = None
+    overlap_cutoff: Positive | None = None
+    van_hove_lag: Positive | None = None
+    core_range: tuple[NotNegative, Positive] | None = None
+    tail_range: tuple[NotNegative, Positive] | None = None
+    max_frames: Annotated[int, Field(ge=1)] | None = None
 
 
 class TrialConfig(_Strict):
@@ -145,6 +168,7 @@ class SweepConfig(_Strict):
     scene: dict[str, Any] = {}
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = {}
     points: list[dict[str, Any]] = []
+    observables: RunObservablesConfig = RunObservablesConfig()
 
     @model_validator(mode="after")
     def _scenes_are_valid(self) -> "SweepConfig":
@@ -154,6 +178,11 @@ class SweepConfig(_Strict):
             raise ValueError(f"{', '.join(both)} stands in both [scene] and [grid]; keep one")
         if "seed" in self.scene or "seed" in self.grid:
             raise ValueError("seeds are given by the key 'seeds', not inside [scene] or [grid]")
+        number = len(self.seeds) * (
+            math.prod(len(values) for values in self.grid.values()) + len(self.points)
+        )
+        if number > MAX_RUNS:
+            raise ValueError(f"the sweep has {number} runs; divide it, {MAX_RUNS} are the most")
         self.scenes()
         return self
 
@@ -323,8 +352,11 @@ phi = [0.95, 0.97]
 v0 = [0.01, 0.03, 0.07]
 eta = [0.01, 0.03]
 
-# [[points]]              # and any single scenes besides
+# [[points]]              # and any single scenes besides; without [grid] a list of scenes
 # phi = 1.0
 # v0 = 0.05
+
+# [observables]           # as in an experiment file; by default as 'observe' does for runs
+# only = ["shape_index", "self_intermediate_scattering"]
 """,
 }

@@ -7,20 +7,27 @@ nothing; finished work is recognised by its key, so a task may be run again afte
 import itertools
 import multiprocessing
 import os
+import platform
+import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from importlib import import_module
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from cellquant.errors import InputError
-from cellquant.storage import finished_key
+from cellquant.fingerprint import code_digest
+from cellquant.lock import remove_stale
+from cellquant.storage import disk_problem, finished_key
 
 Task = dict[str, Any]
 TRIES = 3
+# Kernels of one process must not be called by two threads at once.
+_one_at_a_time = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -91,11 +98,15 @@ def run_tasks(
     command
         Name in the manifests.
     on_finished
-        Called with (tasks finished, tasks in all) whenever one has ended.
+        Called with (tasks finished, tasks in all) at the start and whenever one has ended.
     """
     waiting = [t for t in tasks if finished_key(Path(t["folder"]), command) != t["key"]]
+    for task in tasks:
+        remove_stale(Path(task["folder"]))
     skipped = len(tasks) - len(waiting)
     outcomes: list[Outcome] = []
+    if on_finished is not None:
+        on_finished(skipped, len(tasks))
     for outcome in execute(function, waiting, workers=workers, scheduler=scheduler):
         outcomes.append(outcome)
         if on_finished is not None:
@@ -107,6 +118,37 @@ def run_tasks(
         failures={waiting[o.index]["label"]: str(o.error) for o in failed},
         only_input_errors=all(o.is_input_error for o in failed),
     )
+
+
+def check_code(task: Task, room: str) -> None:
+    """Refuse a task that was made by other code than that of this worker."""
+    if task["code"] != code_digest(room):
+        raise InputError(
+            f"the worker on {platform.node()} has another version of cellquant than the one that "
+            "gives the tasks; install the same version on every machine."
+        )
+
+
+def share(tasks: Sequence[Task], part: str | None) -> list[Task]:
+    """The tasks of one part: ``"I/N"`` is every N-th task from number I (0 to N - 1) on.
+
+    Raises
+    ------
+    InputError
+        If `part` is not of that form.
+    """
+    if part is None:
+        return list(tasks)
+    try:
+        index, number = (int(word) for word in part.split("/"))
+        if not 0 <= index < number:
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"--part takes I/N with I from 0 to N - 1, got {part!r}; e.g. 0/10 for the first of "
+            "ten parts."
+        ) from None
+    return list(tasks[index::number])
 
 
 def execute(
@@ -125,19 +167,22 @@ def execute(
     tasks
         The tasks; JSON-like dictionaries.
     workers
-        Local processes; 1 runs the tasks in this process with all kernel threads.
+        Local processes, which share the cores: no more processes than tasks are started, and each
+        gets an equal number of kernel threads. With one, the tasks run in this process.
     scheduler
         Address or scheduler file of a Dask cluster; used instead of local processes.
 
     Raises
     ------
     InputError
-        If the number of workers is below one, or the scheduler cannot be reached.
+        If the number of workers is below one, or the scheduler cannot be reached or is lost.
     """
     if workers < 1:
         raise InputError(f"--workers must be at least 1, got {workers}.")
     if scheduler is not None:
-        yield from _on_dask(function, tasks, scheduler)
+        from cellquant.cluster import execute_on_dask
+
+        yield from execute_on_dask(function, tasks, scheduler)
     elif workers > 1 and len(tasks) > 1:
         yield from _in_processes(function, tasks, min(workers, len(tasks)))
     else:
@@ -148,18 +193,31 @@ def execute(
 def attempt(function: Callable[[Task], None], task: Task, index: int) -> Outcome:
     """Run one task and turn an exception into an outcome."""
     try:
-        function(task)
+        with _one_at_a_time:
+            function(task)
     except InputError as error:
         return Outcome(index, str(error), is_input_error=True)
-    except Exception:
+    except Exception as error:
+        problem = disk_problem(error)
+        if problem is not None:
+            return Outcome(index, problem, is_input_error=True)
         return Outcome(index, traceback.format_exc())
     return Outcome(index)
 
 
-def _one_kernel_thread() -> None:
-    # Before Numba is imported: as many workers as cores, one kernel thread each.
+def _start_worker(threads: int, parent: Connection) -> None:
+    """Prepare a worker process, before Numba is imported in it."""
     for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[name] = "1"
+        os.environ[name] = str(threads)
+    # A terminal sends its interrupt to every process; the parent decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def end_with_parent() -> None:
+        parent.poll(None)  # readable when the other end is closed, also by a kill
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def _in_processes(
@@ -197,7 +255,10 @@ def _until_broken(
     """Run a batch in one pool; when the pool breaks, stop with the suspects left in flight."""
     context = multiprocessing.get_context("spawn")
     queue = iter(batch)
-    with ProcessPoolExecutor(min(workers, len(batch)), context, _one_kernel_thread) as pool:
+    workers = min(workers, len(batch))
+    theirs, ours = context.Pipe(duplex=False)
+    start = (max(1, _cores() // workers), theirs)
+    with ProcessPoolExecutor(workers, context, _start_worker, start) as pool:
         futures: set[Future[Outcome]] = set()
         try:
             while True:
@@ -213,38 +274,13 @@ def _until_broken(
                     yield outcome
         except BrokenProcessPool:
             return
-        except GeneratorExit:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        finally:
+            if futures:
+                ours.close()  # ends the workers, and with them what they were at
+            theirs.close()
 
 
-def _on_dask(
-    function: Callable[[Task], None], tasks: Sequence[Task], scheduler: str
-) -> Iterator[Outcome]:
-    try:
-        dask: Any = import_module("distributed")
-    except ImportError as error:
-        raise InputError(
-            "--scheduler needs Dask, which is not installed; install 'cellquant[cluster]'."
-        ) from error
-    where = {"scheduler_file": scheduler} if Path(scheduler).is_file() else {"address": scheduler}
-    try:
-        client = dask.Client(**where, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"no Dask scheduler answers at {scheduler} ({error}); start one with 'dask scheduler' "
-            "and give its address or its scheduler file."
-        ) from error
-    with client:
-        futures = {
-            client.submit(attempt, function, task, index, pure=False, retries=TRIES): index
-            for index, task in enumerate(tasks)
-        }
-        for future in dask.as_completed(futures):
-            if future.status == "finished":
-                yield future.result()
-            else:
-                yield Outcome(
-                    futures[future],
-                    f"the cluster lost this task ({future.status}); run the same command again.",
-                )
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

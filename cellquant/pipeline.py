@@ -34,6 +34,7 @@ def track_movie(
     raw: "ImageStack | None" = None,
     options: Mapping[str, Any] | None = None,
     export_ctc: bool = False,
+    key: str | None = None,
     step: Step = silent,
 ) -> "tuple[Cells, Tracks, RunRecord]":
     """Measure and link the cells of a movie; write cells, tracks and the record of the run.
@@ -49,6 +50,8 @@ def track_movie(
         The recorded movie, frame by frame the same as `masks`.
     options
         Keyword arguments of `cellquant.track.track_cells`.
+    key
+        Key of this work, for the record; None where nobody asks for it.
     step
         Gives a progress callback for each stage.
 
@@ -71,7 +74,12 @@ def track_movie(
     chosen = dict(options or {})
     record = RunRecord(
         "track",
-        {**calibrated, "raw": None if raw is None else str(raw.path), **chosen},
+        {
+            **calibrated,
+            "raw": None if raw is None else str(raw.path),
+            **chosen,
+            **({} if key is None else {"key": key}),
+        },
         notes=list(masks.notes),
     )
     with record.stage("digest"):
@@ -238,7 +246,10 @@ def observe_source(
         Keyword arguments of `cellquant.observables.observe`.
     """
     folder = check_output(out)
-    record = RunRecord("observe", {"source": str(source), "only": only, **(options or {})})
+    record = RunRecord(
+        "observe",
+        {"source": str(source), "only": only, "calibration": calibration, **(options or {})},
+    )
     with record.stage("read"):
         data = open_source(
             source,

@@ -6,6 +6,7 @@ folder's manifest ``run.json`` is written last.
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -15,13 +16,28 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from cellquant import __version__
 from cellquant.errors import InputError
+from cellquant.fingerprint import code_digest
+from cellquant.lock import LOCK
 
 MANIFEST = "run.json"
+_LIBRARIES = (
+    *("numpy", "scipy", "numba", "pandas", "pyarrow", "opencv-python-headless"),
+    *("scikit-image", "scikit-learn", "tifffile", "imagecodecs", "zarr", "trackpy"),
+)
+FINISHED = "finished.json"  # folders of the results that belong to a study or a sweep
+STARTED = ".started"  # key of the work that a folder holds, finished or not
+_DISK_ERRORS = {
+    getattr(errno, name)
+    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM")
+    if hasattr(errno, name)
+}
 
 
 @contextlib.contextmanager
@@ -49,7 +65,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        holder = Path(tempfile.mkdtemp(prefix=f".{path.name[:100]}.", dir=path.parent))
+        holder = Path(tempfile.mkdtemp(".partial", f".{path.name[:100]}.", path.parent))
     except OSError as error:
         raise InputError(
             f"cannot write {path}: {error.strerror}; choose an output path in a folder that "
@@ -92,18 +108,33 @@ def check_output(path: str | Path) -> Path:
     return path
 
 
+def make_folder(path: str | Path) -> Path:
+    """Make a folder and those above it; `InputError` where that cannot be done."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot make the folder {path}: {error.strerror}; choose another output path."
+        ) from error
+    return path
+
+
 def _inside(path: Path, folder: Path) -> bool:
     return folder in (path, *path.parents)
 
 
 def _flush(path: Path) -> None:
-    files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
-    for file in files:
-        descriptor = os.open(file, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    for entry in [*path.rglob("*"), path] if path.is_dir() else [path]:
+        _fsync(entry)
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _replace(temporary: Path, path: Path, holder: Path) -> None:
@@ -111,11 +142,7 @@ def _replace(temporary: Path, path: Path, holder: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         path.rename(holder / "replaced")
     temporary.replace(path)
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    _fsync(path.parent)
 
 
 def write_json(path: str | Path, content: Any) -> None:
@@ -150,48 +177,87 @@ def digest(path: str | Path) -> str:
 
 
 def content_key(content: Mapping[str, Any]) -> str:
-    """Key of a task: SHA-256 of its JSON-serialisable description and of the version."""
-    text = json.dumps(
-        {"version": __version__, **content}, sort_keys=True, allow_nan=False, default=_plain
-    )
+    """Key of a task: SHA-256 of its JSON-serialisable description.
+
+    What decides the result belongs into it: configuration, digests of the inputs, and
+    `cellquant.fingerprint.code_digest` of the code.
+    """
+    text = json.dumps(content, sort_keys=True, allow_nan=False, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def finished_key(folder: Path, command: str) -> str | None:
     """Key of the work that `command` finished in a folder; None where there is none."""
+    return _key_of(_read_manifest(folder), command)
+
+
+def earlier_record(folder: Path, command: str, key: str) -> dict[str, Any] | None:
+    """Record of the finished work of `command` with this key, also where others came after it."""
+    last = _read_manifest(folder)
+    records = [last, *(last.get("earlier", []) if isinstance(last, dict) else [])]
+    return next((r for r in records if _key_of(r, command) == key), None)
+
+
+def _read_manifest(folder: Path) -> Any:
     try:
-        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        key = content["settings"]["key"] if content["command"] == command else None
-    except (OSError, ValueError, KeyError, TypeError):
+        return json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _key_of(record: Any, command: str) -> str | None:
+    try:
+        key = record["settings"]["key"] if record["command"] == command else None
+    except (KeyError, TypeError):
         return None
     return key if isinstance(key, str) else None
 
 
-@contextlib.contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system frees even when the process is killed.
+def begin(folder: Path, key: str) -> None:
+    """Make a folder ready for the work with this key: what another work left there is removed.
 
-    Raises
-    ------
-    InputError
-        If another process is working on the same folder.
+    Unfinished work with the same key is kept, apart from files that were not finished. The caller
+    holds the folder's lock.
     """
-    descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    started = folder / STARTED
     try:
-        try:
-            import fcntl
+        same = started.read_text(encoding="utf-8") == key
+    except (OSError, UnicodeDecodeError):
+        same = False
+    if same:
+        remove_partial(folder)
+        return
+    started.unlink(missing_ok=True)
+    for entry in folder.iterdir():
+        if entry.name.startswith(LOCK):
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+    with atomic_path(started) as path:
+        path.write_text(key, encoding="utf-8")
 
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(
-                f"another cellquant process is writing to {folder}; wait until it has finished, "
-                "or choose another output folder."
-            ) from error
-        except (ImportError, OSError):
-            pass  # a file system without locks: renames still keep every file whole
-        yield
-    finally:
-        os.close(descriptor)
+
+def remove_partial(folder: Path, *, below: bool = True) -> None:
+    """Remove what killed writers left under temporary names; the caller holds the lock."""
+    find = folder.rglob if below else folder.glob
+    for entry in list(find("*.partial")):
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        elif not entry.name.startswith(LOCK):
+            entry.unlink(missing_ok=True)
+
+
+def disk_problem(error: BaseException) -> str | None:
+    """One sentence for a disk that is full, read-only or closed to us; None for other errors."""
+    if not isinstance(error, OSError) or error.errno is None or error.errno not in _DISK_ERRORS:
+        return None
+    what = f"cannot write {error.filename}" if error.filename else "cannot write the results"
+    return (
+        f"{what}: {os.strerror(error.errno)}; free space or choose an output folder that you may "
+        "write to, then run the same command again."
+    )
 
 
 @dataclass
@@ -234,12 +300,21 @@ class RunRecord:
             }
         )
 
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> "RunRecord":
+        """The record that `as_dict` has written."""
+        parts = ("settings", "inputs", "notes", "counts", "stages")
+        return cls(content["command"], **{name: content[name] for name in parts})
+
     def as_dict(self) -> dict[str, Any]:
         """Everything known, with version and machine; JSON-serialisable."""
         return {
             "program": "cellquant",
             "version": __version__,
+            "code": code_digest("pipeline"),
+            "libraries": libraries(),
             "command": self.command,
+            "working_folder": os.getcwd(),
             "settings": dict(self.settings),
             "inputs": self.inputs,
             "notes": self.notes,
@@ -265,6 +340,16 @@ def _earlier(path: Path) -> list[dict[str, Any]]:
         return [*content.pop("earlier", []), content]
     except (OSError, ValueError, AttributeError, TypeError):
         return []
+
+
+@cache
+def libraries() -> dict[str, str]:
+    """Versions of the libraries that a result can depend on."""
+    found = {}
+    for name in _LIBRARIES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
 
 
 def machine() -> dict[str, Any]:

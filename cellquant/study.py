@@ -51,7 +51,10 @@ def write_study(
     with atomic_path(folder / "stacks.parquet") as path:
         write_table(stacks, path, units=units)
     times = relaxation_times(tasks)
-    if times is not None:
+    if times is None:  # nor may those of another configuration stay
+        for name in ("relaxation_times.parquet", "trial_values.parquet", "statistics.json"):
+            (folder / name).unlink(missing_ok=True)
+    else:
         with atomic_path(folder / "relaxation_times.parquet") as path:
             write_table(times, path, units=units)
         trials = trial_values(stacks)

@@ -1,22 +1,29 @@
 """A sweep: a grid or list of scenes times seeds, each simulated and observed, resumable.
 
-Each scene with its seed is a task with a folder of its own, named by the key of its work, so that
-a changed sweep file reuses what it has in common with an earlier one.
+Each scene with its seed is a task with a folder of its own, named by the scene, so that a changed
+sweep file reuses what it has in common with an earlier one.
 """
 
+import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cellquant.config import SceneConfig, SweepConfig, load
-from cellquant.engines import BatchOutcome, Task, run_tasks
+from cellquant.engines import BatchOutcome, Task, check_code, run_tasks, share
+from cellquant.fingerprint import code_digest
+from cellquant.lock import only_writer
 from cellquant.storage import (
+    FINISHED,
     RunRecord,
     atomic_path,
+    begin,
     check_output,
     content_key,
     finished_key,
-    only_writer,
+    make_folder,
+    remove_partial,
     write_json,
 )
 
@@ -33,38 +40,59 @@ RESULTS = {
     "sigma2": "van_hove.sigma2",
     "xi": "van_hove.xi",
 }
-PILOT_TIME = 5.0  # t0 simulated to estimate the cost of a scene
+GATHER_SHARE = 0.02  # of the time may go into keeping the tables up to date
 
 
 def sweep_tasks(config: SweepConfig, folder: Path) -> list[Task]:
     """Tasks of a sweep, in the order of its file."""
+    code = code_digest("sweep")
+    options = config.observables.model_dump(exclude_none=True)
+    varied = {*config.grid, *(name for point in config.points for name in point)}
+    names = [n for n in SceneConfig.model_fields if n in {"phi", "v0", "eta", "seed", *varied}]
     tasks = []
     for scene in config.scenes():
-        key = content_key({"scene": scene.model_dump()})
-        names = ("phi", "v0", "eta", "seed")
+        content = scene.model_dump()
+        run_key = content_key({"code": code, "scene": content})
         tasks.append(
             {
-                "label": ", ".join(f"{name} {getattr(scene, name):g}" for name in names),
-                "scene": scene.model_dump(),
-                "key": key,
-                "folder": str(folder / "runs" / key[:16]),
+                "label": ", ".join(f"{name} {content[name]}" for name in names),
+                "scene": content,
+                "observables": options,
+                "code": code,
+                "run_key": run_key,
+                "key": content_key({"run": run_key, "observables": options}),
+                "folder": str(folder / "runs" / content_key(content)[:16]),
             }
         )
     return tasks
 
 
+def count_runs(path: str | Path) -> int:
+    """Number of runs of a sweep file."""
+    return len(load(path, SweepConfig).scenes())
+
+
 def work_on_scene(task: Task) -> None:
     """Simulate and observe one scene, going on from its checkpoint where there is one."""
+    check_code(task, "sweep")
+    folder = make_folder(task["folder"])
+    with only_writer(folder, wait=True):
+        if finished_key(folder, "sweep") != task["key"]:
+            begin(folder, task["run_key"])
+            _simulate_and_observe(task, folder)
+
+
+def _simulate_and_observe(task: Task, folder: Path) -> None:
     from cellquant.pipeline import observe_into, simulate_scene
 
-    folder = Path(task["folder"])
-    if finished_key(folder, "sweep") == task["key"]:
-        return
+    for entry in [*folder.glob("*.parquet"), *folder.glob("*.json")]:
+        entry.unlink()  # measured with other options, or not finished
     scene = SceneConfig.model_validate(task["scene"])
-    record = RunRecord("sweep", {**task["scene"], "key": task["key"]})
+    settings = {**task["scene"], **task["observables"], "code": task["code"], "key": task["key"]}
+    record = RunRecord("sweep", settings)
     with record.stage("simulate"):
         run = simulate_scene(scene, folder / "run.zarr")
-    observe_into(run.to_tracks(), folder, record)
+    observe_into(run.to_tracks(), folder, record, options=task["observables"])
     record.write(folder)
 
 
@@ -74,6 +102,7 @@ def run_sweep(
     *,
     workers: int = 1,
     scheduler: str | None = None,
+    part: str | None = None,
     progress: Progress | None = None,
 ) -> BatchOutcome:
     """Work through a sweep file: simulate, observe, and gather the results of every scene.
@@ -83,11 +112,14 @@ def run_sweep(
     path
         The sweep file.
     out
-        Output folder: ``runs/KEY`` for each run, ``sweep.parquet`` with a row per run,
+        Output folder: ``runs/SCENE`` for each run, ``sweep.parquet`` with a row per run,
         ``maps.parquet`` with a row per scene (mean and standard error over seeds). Both tables
         are kept up to date while the sweep goes on.
     workers, scheduler
         See `cellquant.engines.execute`.
+    part
+        ``"I/N"``: work on every N-th run from number I on and leave the tables to a last call
+        without `part`. Several parts may be worked on at the same time.
     progress
         Called with (runs finished, runs in all).
 
@@ -98,29 +130,71 @@ def run_sweep(
         reason stands in the outcome.
     """
     path = Path(path)
-    config = load(path, SweepConfig)
+    return sweep_config(
+        load(path, SweepConfig),
+        out,
+        source=path,
+        workers=workers,
+        scheduler=scheduler,
+        part=part,
+        progress=progress,
+    )
+
+
+def sweep_config(
+    config: SweepConfig,
+    out: str | Path,
+    *,
+    source: Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    part: str | None = None,
+    progress: Progress | None = None,
+) -> BatchOutcome:
+    """Work through a sweep; as `run_sweep`, with the configuration already read.
+
+    Parameters
+    ----------
+    source
+        The file that the configuration was read from, for the record.
+    """
     folder = check_output(out)
     tasks = sweep_tasks(config, folder)
+    mine = share(tasks, part)
     record = RunRecord("sweep", config.model_dump())
-    record.add_input(path)
-    folder.mkdir(parents=True, exist_ok=True)
+    if source is not None:
+        record.add_input(source)
+    folder = make_folder(folder)
+    if part is not None:
+        return run_tasks(
+            work_on_scene,
+            mine,
+            command="sweep",
+            workers=workers,
+            scheduler=scheduler,
+            on_finished=progress,
+        )
+    gathered = _Gathered(folder, tasks)
 
     def keep_up(done: int, total: int) -> None:
-        _gather(folder, tasks)
+        gathered.keep_up()
         if progress is not None:
             progress(done, total)
 
     with only_writer(folder):
-        with record.stage("runs"):
-            outcome = run_tasks(
-                work_on_scene,
-                tasks,
-                command="sweep",
-                workers=workers,
-                scheduler=scheduler,
-                on_finished=keep_up,
-            )
-        _gather(folder, tasks)
+        remove_partial(folder, below=False)
+        try:
+            with record.stage("runs"):
+                outcome = run_tasks(
+                    work_on_scene,
+                    tasks,
+                    command="sweep",
+                    workers=workers,
+                    scheduler=scheduler,
+                    on_finished=keep_up,
+                )
+        finally:  # also of a sweep that is interrupted or loses its cluster
+            gathered.write()
         record.counts = {"runs": len(tasks), "failed": len(outcome.failures)}
         record.notes = [f"{name}: {reason}" for name, reason in outcome.failures.items()]
         write_json(folder / "failures.json", outcome.failures)
@@ -128,49 +202,68 @@ def run_sweep(
     return outcome
 
 
-def _gather(folder: Path, tasks: Sequence[Task]) -> None:
-    """Write the tables of what is finished so far."""
-    from cellquant.tables import REDUCED, write_table
+class _Gathered:
+    """The tables of a sweep, written again from time to time while it goes on."""
 
-    runs = sweep_table(tasks)
-    if runs is None:
-        return
-    with atomic_path(folder / "sweep.parquet") as path:
-        write_table(runs, path, units=REDUCED)
-    with atomic_path(folder / "maps.parquet") as path:
-        write_table(map_table(runs), path, units=REDUCED)
+    def __init__(self, folder: Path, tasks: Sequence[Task]) -> None:
+        self.folder, self.tasks = folder, tasks
+        self.rows: dict[int, dict[str, Any]] = {}
+        self.next = 0.0
+
+    def keep_up(self) -> None:
+        """Write the tables, unless that was done a short while ago."""
+        started = time.monotonic()
+        if started >= self.next:
+            self.write()
+            now = time.monotonic()
+            self.next = now + max(1.0, (now - started) / GATHER_SHARE)
+
+    def write(self) -> None:
+        """Write the tables of what is finished so far; each run is read once."""
+        from cellquant.tables import REDUCED, write_table
+
+        for index, task in enumerate(self.tasks):
+            if index not in self.rows:
+                row = _row(task)
+                if row is not None:
+                    self.rows[index] = row
+        if not self.rows:
+            return
+        runs = sweep_table([self.rows[index] for index in sorted(self.rows)])
+        with atomic_path(self.folder / "sweep.parquet") as path:
+            write_table(runs, path, units=REDUCED)
+        with atomic_path(self.folder / "maps.parquet") as path:
+            write_table(map_table(runs), path, units=REDUCED)
+        write_json(self.folder / FINISHED, [f"runs/{name}" for name in runs["folder"]])
 
 
-def sweep_table(tasks: Sequence[Task]) -> "pd.DataFrame | None":
-    """One row per finished run: its scene, its seed, and every scalar with its standard error.
+def _row(task: Task) -> dict[str, Any] | None:
+    """Scene, seed and every scalar with its standard error; None while the run is not finished."""
+    folder = Path(task["folder"])
+    if finished_key(folder, "sweep") != task["key"]:
+        return None
+    summary = json.loads((folder / "summary.json").read_text("utf-8"))
+    row: dict[str, Any] = {
+        name: json.dumps(value) if isinstance(value, list | tuple) else value
+        for name, value in task["scene"].items()
+        if value is not None
+    }
+    for name, place in RESULTS.items():
+        group, part = place.split(".")
+        found: Mapping[str, Any] = summary.get(group) or {}
+        error = "std_error" if part in {"mean", "value"} else f"{part}_std_error"
+        row[name] = _number(found.get(part))
+        row[f"{name}_std_error"] = _number(found.get(error))
+    row["tau_alpha_censored_at"] = _number((summary.get("tau_alpha") or {}).get("censored_at"))
+    row["folder"] = folder.name
+    return row
 
-    Returns
-    -------
-    pandas.DataFrame or None
-        None when no run is finished yet.
-    """
-    import json
 
+def sweep_table(rows: Sequence[Mapping[str, Any]]) -> "pd.DataFrame":
+    """One row per finished run: its scene, its seed, and every scalar with its standard error."""
     import numpy as np
     import pandas as pd
 
-    rows = []
-    for task in tasks:
-        if finished_key(Path(task["folder"]), "sweep") != task["key"]:
-            continue
-        summary = json.loads((Path(task["folder"]) / "summary.json").read_text("utf-8"))
-        row: dict[str, Any] = {k: v for k, v in task["scene"].items() if v is not None}
-        for name, place in RESULTS.items():
-            group, part = place.split(".")
-            found: Mapping[str, Any] = summary.get(group) or {}
-            error = "std_error" if part in {"mean", "value"} else f"{part}_std_error"
-            row[name] = _number(found.get(part))
-            row[f"{name}_std_error"] = _number(found.get(error))
-        row["tau_alpha_censored_at"] = _number((summary.get("tau_alpha") or {}).get("censored_at"))
-        row["folder"] = Path(task["folder"]).name
-        rows.append(row)
-    if not rows:
-        return None
     table = pd.DataFrame(rows)
     measured = [n for n in table.columns if str(n).startswith(tuple(RESULTS))]
     return table.astype(dict.fromkeys(measured, np.float64))
@@ -210,52 +303,3 @@ def map_table(runs: "pd.DataFrame") -> "pd.DataFrame":
         row["tau_alpha_n_censored"] = censored
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def estimate_cost(path: str | Path, *, workers: int = 1) -> dict[str, Any]:
-    """Estimate the cost of a sweep from short pilot runs on this machine.
-
-    For every scene that differs in more than its seed, `PILOT_TIME` is simulated after the
-    kernels are compiled, and its processor time is scaled to the whole run.
-
-    Returns
-    -------
-    dict
-        runs, cpu_s (one thread), wall_s (with `workers`), disk_MB.
-    """
-    import time
-
-    from cellquant.sim import Scene, simulate
-
-    config = load(path, SweepConfig)
-    cost: dict[str, float] = {}
-    total, disk = 0.0, 0.0
-    scenes = config.scenes()
-    for scene in scenes:
-        content = {k: v for k, v in scene.model_dump().items() if k != "seed"}
-        key = content_key(content)
-        if key not in cost:
-            seconds = []
-            for _ in range(2):  # the first compiles
-                started = time.process_time()
-                simulate(
-                    Scene.from_config(scene),
-                    duration=PILOT_TIME,
-                    contact=scene.contact,
-                    points=scene.points,
-                    integrator=scene.integrator,
-                    dt=scene.dt,
-                    tolerance=scene.tolerance,
-                )
-                seconds.append(time.process_time() - started)
-            cost[key] = min(seconds) / PILOT_TIME * (scene.transient + scene.duration)
-        total += cost[key]
-        frames = scene.duration / (scene.save_every or max(1.0, scene.duration / 2000))
-        disk += frames * scene.cells * (3 + 2 * (scene.modes - 1)) * 8 / 1e6
-    return {
-        "runs": len(scenes),
-        "scenes": len(cost),
-        "cpu_s": round(total, 1),
-        "wall_s": round(total / workers, 1),
-        "disk_MB": round(disk, 1),
-    }

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cellquant.errors import InputError
+from cellquant.parquet import check_promises, decode_texts, text_columns
 
 CELL_COLUMNS: Mapping[str, str] = {
     "frame": "int64",
@@ -286,7 +287,7 @@ def read_table(
     if not path.is_file():
         raise InputError(f"{path} does not exist; give the path of a parquet table.")
     try:
-        schema = pq.read_schema(path)
+        schema = check_promises(path)
         raw = schema.metadata or {}
         units = Units(raw[b"length_unit"].decode(), raw[b"time_unit"].decode())
         metadata = json.loads(raw[b"cellquant"])
@@ -296,7 +297,9 @@ def read_table(
                 f"{path} is not a {kind} table: it lacks the columns {', '.join(missing)}; "
                 "make one with 'cellquant track MASKS -o DIR'."
             )
-        arrow = pq.read_table(path, columns=None if columns is None else list(columns))
+        wanted = list(schema.names if columns is None else columns)
+        texts = [name for name in text_columns(schema) if name in wanted]
+        arrow = decode_texts(path, pq.read_table(path, columns=wanted, read_dictionary=texts))
         # Each column is freed as soon as it is converted, or the table would be held twice.
         table = arrow.to_pandas(split_blocks=True, self_destruct=True)
     except KeyError as error:
@@ -304,9 +307,11 @@ def read_table(
             f"{path} carries no {error} in its schema metadata, so its numbers have no unit; "
             "use a table written by cellquant."
         ) from error
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except InputError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:300]
         raise InputError(
-            f"{path} is not a readable parquet table ({str(error).splitlines()[0]}); "
-            "make it again from its source."
+            f"{path} is not a readable parquet table ({reason}); make it again from its source."
         ) from error
     return table, units, metadata

@@ -15,7 +15,6 @@ import tifffile
 
 from cellquant.batch import run_experiment
 from cellquant.errors import InputError
-from cellquant.storage import only_writer
 from examples import drifting_discs, shuffled
 
 HEAD = """
@@ -86,6 +85,50 @@ def test_changed_input_and_configuration_are_worked_on_again(study: Path, tmp_pa
     assert run_experiment(study, out).done == 3
 
 
+def test_other_observables_are_measured_on_the_tracks_that_are_there(
+    study: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run_experiment(study, out)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("tracks.parquet")}
+    study.write_text(study.read_text() + '\n[observables]\nonly = ["shape_index"]\n')
+    assert run_experiment(study, out).done == 3
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("tracks.parquet")}
+    assert not list((out / "stacks").rglob("msd.parquet"))
+    run_experiment(study, tmp_path / "fresh")
+    assert tables(out) == tables(tmp_path / "fresh")
+
+
+def test_parts_of_a_job_array_and_the_gathering(study: Path, tmp_path: Path) -> None:
+    """The lines of the script run here as SLURM would run them on its nodes."""
+    study.write_text(study.read_text() + '\n[observables]\nonly = ["shape_index"]\n')
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "cellquant", "run", str(study), "-o", str(out)]
+    emitted = subprocess.run(
+        [*command, "--emit", "slurm-array", "--parts", "2"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    script = out / "slurm_array.sh"
+    assert emitted.stdout == f"submit with: sbatch {script}\n"
+    assert "#SBATCH --array=0-1" in script.read_text()
+    for part, stacks in (("1", 1), ("0", 3)):
+        subprocess.run([str(script)], check=True, env={**os.environ, "SLURM_ARRAY_TASK_ID": part})
+        assert len(list(out.glob("stacks/*/*/*/run.json"))) == stacks
+        assert not (out / "run.json").exists()
+    gathered = subprocess.run([str(script), "gather"], check=True, capture_output=True, text=True)
+    assert "0 done, 3 finished before" in gathered.stdout
+    run_experiment(study, tmp_path / "whole")
+    assert tables(out) == tables(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("part", ["2/2", "-1/2", "1", "a/b", "0/0"])
+def test_a_wrong_part_is_refused(study: Path, tmp_path: Path, part: str) -> None:
+    with pytest.raises(InputError, match="--part takes I/N"):
+        run_experiment(study, tmp_path / "out", part=part)
+
+
 def test_one_bad_stack_does_not_stop_the_others(study: Path, tmp_path: Path) -> None:
     (tmp_path / "a" / "one.tif").write_bytes(b"no TIFF")
     outcome = run_experiment(study, tmp_path / "out")
@@ -131,17 +174,6 @@ def test_a_killed_run_is_finished_by_the_same_command(study: Path, tmp_path: Pat
     outcome = run_experiment(study, killed)
     assert (outcome.done, outcome.skipped) == (2, 1)
     assert tables(killed) == tables(tmp_path / "whole")
-
-
-def test_two_processes_do_not_write_to_one_folder(tmp_path: Path) -> None:
-    with (
-        only_writer(tmp_path),
-        pytest.raises(InputError, match="another cellquant process"),
-        only_writer(tmp_path),
-    ):
-        pass
-    with only_writer(tmp_path):
-        pass
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,7 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -63,56 +60,6 @@ def test_a_task_that_always_kills_its_worker_is_given_up(tmp_path: Path) -> None
     assert all(f"killed {TRIES} times" in str(o.error) for o in outcomes)
 
 
-@pytest.fixture
-def dask_cluster(tmp_path: Path) -> Iterator[str]:
-    """A real scheduler and two worker processes over TCP; yields the scheduler file."""
-    pytest.importorskip("distributed", reason="Dask is not installed")
-    file = tmp_path / "scheduler.json"
-    dask = [sys.executable, "-m", "dask"]
-    commands = [
-        [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"],
-        *([[*dask, "worker", "--nworkers", "1", "--nthreads", "1", "--no-dashboard"]] * 2),
-    ]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    processes = []
-    for index, command in enumerate(commands):
-        with (tmp_path / f"process{index}.log").open("w") as log:
-            processes.append(
-                subprocess.Popen(
-                    [*command, "--scheduler-file", str(file)],
-                    stdout=log,
-                    stderr=log,
-                    env=environment,
-                )
-            )
-    while not file.exists():
-        assert processes[0].poll() is None, (tmp_path / "process0.log").read_text()
-        time.sleep(0.1)
-    try:
-        yield str(file)
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.wait(timeout=30)
-
-
-@pytest.mark.slow
-def test_a_dask_cluster_does_what_this_process_does(dask_cluster: str, tmp_path: Path) -> None:
-    tasks = tasks_for(tmp_path, [3, -1, 13, 4])
-    outcomes = sorted(execute(write_square, tasks, scheduler=dask_cluster), key=lambda o: o.index)
-    assert [o.is_input_error for o in outcomes] == [False, True, False, False]
-    assert "RuntimeError: thirteen" in str(outcomes[2].error)
-    assert (tmp_path / "3").read_text() == "9"
-    assert (tmp_path / "4").read_text() == "16"
-
-
 def test_no_worker_is_refused() -> None:
     with pytest.raises(InputError, match="at least 1"):
         list(execute(write_square, [], workers=0))
-
-
-def test_an_absent_scheduler_is_named(tmp_path: Path) -> None:
-    pytest.importorskip("distributed", reason="Dask is not installed")
-    with pytest.raises(InputError, match="no Dask scheduler answers at"):
-        list(execute(write_square, tasks_for(tmp_path, [1]), scheduler="tcp://127.0.0.1:1"))

@@ -10,11 +10,14 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "cellquant"
 
 # Each room may import the rooms named here (and itself); the data flow one way.
-FOUNDATION = {"errors", "tables", "storage", "config", "io"}
+FOUNDATION = {"errors", "tables", "storage", "lock", "fingerprint", "config", "io"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
-    "tables": {"errors"},
-    "storage": {"errors", "tables"},
+    "parquet": {"errors"},
+    "tables": {"errors", "parquet"},
+    "lock": {"errors"},
+    "fingerprint": set(),
+    "storage": {"errors", "lock", "fingerprint"},
     "config": {"errors", "tables", "storage"},
     "io": {"errors", "tables", "storage", "config"},
     "statistics": FOUNDATION,
@@ -23,12 +26,16 @@ ALLOWED: dict[str, set[str]] = {
     "track": FOUNDATION | {"observables", "statistics", "segment"},
     "sim": FOUNDATION | {"observables", "statistics"},
     "compare": FOUNDATION | {"observables", "statistics", "segment", "track", "sim"},
-    "engines": FOUNDATION,
+    "engines": FOUNDATION | {"cluster"},
+    "cluster": FOUNDATION | {"engines"},
     "pipeline": FOUNDATION | {"observables", "segment", "track", "sim"},
     "study": FOUNDATION | {"observables", "statistics", "compare"},
     "batch": FOUNDATION
     | {"observables", "segment", "track", "sim", "compare", "pipeline", "engines", "study"},
     "sweep": FOUNDATION | {"observables", "sim", "pipeline", "engines"},
+    "slurm": FOUNDATION,
+    "estimate": FOUNDATION | {"observables", "sim"},
+    "rerun": FOUNDATION | {"sim", "pipeline", "batch", "sweep"},
     "closed_loop": FOUNDATION | {"observables", "segment", "track", "sim", "pipeline"},
     "demo": FOUNDATION | {"observables", "track", "sim", "compare", "pipeline", "closed_loop"},
 }

@@ -1,5 +1,6 @@
 """Crash-safe output: complete or absent, whatever happens in between."""
 
+import errno
 import json
 import os
 import signal
@@ -9,9 +10,19 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import tifffile
 
 from cellquant.errors import InputError
-from cellquant.storage import RunRecord, atomic_path, content_key, digest, write_json
+from cellquant.storage import (
+    RunRecord,
+    atomic_path,
+    begin,
+    content_key,
+    digest,
+    disk_problem,
+    write_json,
+)
+from examples import drifting_discs
 
 
 def test_a_failing_block_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -106,3 +117,52 @@ def test_the_record_names_stages_and_inputs(tmp_path: Path) -> None:
     assert saved["stages"][0]["stage"] == "read"
     assert {"wall_s", "cpu_s"} <= set(saved["stages"][0])
     assert saved["machine"]["cores"] >= 1
+
+
+def test_another_work_in_a_folder_is_removed_and_the_same_is_kept(tmp_path: Path) -> None:
+    begin(tmp_path, "one")
+    (tmp_path / "half.parquet").write_text("half")
+    (tmp_path / ".half.parquet.x.partial").mkdir()
+    begin(tmp_path, "one")
+    assert {p.name for p in tmp_path.iterdir()} == {".started", "half.parquet"}
+    begin(tmp_path, "two")
+    assert {p.name for p in tmp_path.iterdir()} == {".started"}
+
+
+def test_only_errors_of_the_disk_are_the_users(tmp_path: Path) -> None:
+    full = OSError(errno.ENOSPC, "full", str(tmp_path / "a"))
+    assert "No space left" in str(disk_problem(full))
+    assert str(tmp_path / "a") in str(disk_problem(full))
+    assert disk_problem(FileNotFoundError(errno.ENOENT, "gone")) is None
+    assert disk_problem(RuntimeError("ours")) is None
+
+
+@pytest.mark.parametrize("command", ["track", "sweep"])
+def test_a_disk_that_fills_up_is_one_sentence(tmp_path: Path, command: str) -> None:
+    """No file may grow beyond 3 kB: the writers meet EFBIG in the middle of their work."""
+    movie, sweep = tmp_path / "m.tif", tmp_path / "s.toml"
+    tifffile.imwrite(movie, drifting_discs(5))
+    sweep.write_text("[scene]\ncells = 9\ntransient = 0\nduration = 3\n")
+    arguments = {
+        "track": [str(movie), "--pixel-size", "0.5", "--frame-interval", "10"],
+        "sweep": [str(sweep)],
+    }[command]
+    code = f"""
+        import resource, sys
+        from cellquant.cli import main
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
+        sys.argv = ["cellquant", {command!r}, *{arguments!r}, "-o", {str(tmp_path / "out")!r}]
+        main()
+    """
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "File too large" in done.stderr + done.stdout
+    assert not list((tmp_path / "out").rglob("*.partial"))

@@ -3,12 +3,15 @@
 Heavy modules are imported inside the commands, so that ``cellquant --help`` starts at once.
 """
 
+import signal
 import sys
+from types import FrameType
 
 import typer
 
 from cellquant import __version__
-from cellquant.cli import layers, movies, reports
+from cellquant.cli import batch, layers, movies, reports
+from cellquant.cli.console import complain
 from cellquant.errors import InputError
 
 app = typer.Typer(
@@ -37,14 +40,30 @@ def _program(
     pass
 
 
-for module in (movies, layers, reports):
+for module in (movies, layers, batch, reports):
     module.register(app)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
 
 
 def main() -> None:
     """Run the program; exit codes: 0 done, 2 wrong input, 1 a fault of ours, 130 interrupted."""
+    # A batch system ends a job with SIGTERM: that is an interruption like any other.
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         app()
     except InputError as error:
-        print(f"cellquant: error: {error}", file=sys.stderr)
+        complain(str(error))
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except OSError as error:
+        from cellquant.storage import disk_problem
+
+        problem = disk_problem(error)
+        if problem is None:
+            raise
+        complain(problem)
         sys.exit(2)

@@ -1,4 +1,4 @@
-"""Commands of the simulation side: simulate, render, sweep, convergence."""
+"""Commands of the simulation side: simulate, render, convergence."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cellquant.cli.console import note, say, step
-from cellquant.errors import InputError
+from cellquant.cli.console import Progress, ProgressOption, note, say, step
 
 SceneFile = Annotated[
     Path | None, typer.Argument(help="scene.toml; options given besides override it.")
@@ -43,6 +42,7 @@ def simulate(
         float | None, typer.Option(help="Error tolerance of the adaptive integrator, L0.")
     ] = None,
     save_every: Annotated[float | None, typer.Option(help="Time between saved states, t0.")] = None,
+    progress: ProgressOption = Progress.auto,
 ) -> None:
     """Simulate one layer; run the same command again to resume one that was interrupted."""
     from cellquant.cli.text import run_lines
@@ -112,39 +112,6 @@ def render(
     say(f"true tracks: {done.truth}, {done.tracks.n_tracks} tracks")
 
 
-def sweep(
-    file: Annotated[Path, typer.Argument(help="sweep.toml", metavar="SWEEP.toml")],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Output folder.")] = None,
-    workers: Annotated[int, typer.Option(help="Local worker processes.")] = 1,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address or scheduler file of a Dask cluster.")
-    ] = None,
-    estimate: Annotated[
-        bool, typer.Option("--estimate", help="Print what the sweep would cost, and stop.")
-    ] = False,
-) -> None:
-    """Simulate a grid of scenes with several seeds; run it again to resume."""
-    from cellquant.sweep import estimate_cost, run_sweep
-
-    if estimate:
-        cost = estimate_cost(file, workers=workers)
-        say(
-            f"{cost['runs']} runs of {cost['scenes']} scenes: about {cost['cpu_s']:g} s of "
-            f"processor time, {cost['wall_s']:g} s with {workers} workers, "
-            f"{cost['disk_MB']:g} MB before compression"
-        )
-        return
-    if output is None:
-        raise InputError("sweep needs an output folder: -o DIR (or '--estimate' for its cost).")
-    with step("runs", unit="runs") as progress:
-        outcome = run_sweep(file, output, workers=workers, scheduler=scheduler, progress=progress)
-    for line in outcome.as_lines("runs"):
-        say(line)
-    note(f"wrote {output / 'sweep.parquet'}")
-    if outcome.failures:
-        raise typer.Exit(2 if outcome.only_input_errors else 1)
-
-
 def convergence(
     output: Annotated[Path, typer.Option("-o", "--output", help="Output folder.")],
     scene: SceneFile = None,
@@ -195,5 +162,5 @@ def convergence(
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
-    for command in (simulate, render, sweep, convergence):
+    for command in (simulate, render, convergence):
         app.command()(command)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cellquant.cli.console import note, say, say_json, step
+from cellquant.cli.console import Progress, ProgressOption, note, say, say_json, step
 from cellquant.errors import InputError
 
 PixelSize = Annotated[
@@ -106,6 +106,7 @@ def track(
     export: Annotated[
         TrackFormat | None, typer.Option(help="Also write DIR/ctc, a CTC folder.")
     ] = None,
+    progress: ProgressOption = Progress.auto,
 ) -> None:
     """Link the cells of label masks into trajectories: DIR/tracks.parquet and DIR/cells.parquet."""
     from cellquant.cli.text import track_lines

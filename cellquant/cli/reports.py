@@ -1,4 +1,4 @@
-"""Commands that bring things together: demo, run, config."""
+"""Commands that bring things together: demo, compare, convert-units, config."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -24,27 +24,6 @@ def demo(
 
     report = run_demo(output, seed=seed, step=step)
     note(f"open {report}")
-
-
-def run(
-    experiment: Annotated[Path, typer.Argument(help="experiment.toml")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Output folder.")],
-    workers: Annotated[int, typer.Option(help="Local worker processes.")] = 1,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address or scheduler file of a Dask cluster.")
-    ] = None,
-) -> None:
-    """Work through a whole study; run it again to resume, finished stacks are not repeated."""
-    from cellquant.batch import run_experiment
-
-    with step("stacks", unit="stacks") as progress:
-        outcome = run_experiment(
-            experiment, output, workers=workers, scheduler=scheduler, progress=progress
-        )
-    for line in outcome.as_lines("stacks"):
-        say(line)
-    if outcome.failures:
-        raise typer.Exit(2 if outcome.only_input_errors else 1)
 
 
 def compare(
@@ -127,7 +106,6 @@ def config_init(
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
     app.command()(demo)
-    app.command()(run)
     app.command()(compare)
     app.command()(convert_units)
     app.add_typer(config, name="config")

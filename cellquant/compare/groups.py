@@ -24,6 +24,7 @@ from cellquant.compare.results import (
 )
 from cellquant.compare.sources import run_of
 from cellquant.errors import InputError
+from cellquant.storage import FINISHED
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 SCENE_KEYS = ("phi", "v0", "eta")
@@ -135,7 +136,7 @@ def _groups_of(source: Any, name: str) -> list[Group]:
         label = result.name if named or not scene else _scene_name(scene)
         return [Group(label, result.simulated, {"1": (result,)}, scene)]
     folder = Path(source)
-    paths = sorted(path.parent for path in folder.rglob("summary.json"))
+    paths = _finished(folder)
     if not paths:
         raise InputError(
             f"{folder} holds no summary.json, nor does any folder below it; give a folder that "
@@ -162,6 +163,17 @@ def _groups_of(source: Any, name: str) -> list[Group]:
         if members
     ]
     return sorted(groups, key=lambda group: tuple(group.scene.values()))
+
+
+def _finished(folder: Path) -> list[Path]:
+    """Folders of results below a folder: those that a study or sweep lists as its own, else all."""
+    found = sorted(path.parent for path in folder.rglob("summary.json"))
+    try:
+        listed = json.loads((folder / FINISHED).read_text("utf-8"))
+        own = {folder / str(name) for name in listed}
+    except (OSError, ValueError, TypeError):
+        return found
+    return [path for path in found if path in own]
 
 
 def _without_seed(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """A run on disk: a zarr group that grows frame by frame and can be read meanwhile."""
 
-import json
 import math
 import os
 from collections.abc import Sequence
@@ -16,13 +15,16 @@ from numpy.typing import NDArray
 
 from cellquant import __version__
 from cellquant.errors import InputError
+from cellquant.io.runstore import check_run_store, read_arrays
 from cellquant.sim.scene import Scene
 from cellquant.sim.shapes import measure_shapes, shape_indices
+from cellquant.storage import atomic_path
 from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
 
 Floats = NDArray[np.float64]
 CHECKPOINT = "checkpoint.npz"
 _SHAPE_COLUMNS = ("perimeter", "shape_index", "aspect_ratio", "orientation")
+_SETTINGS = ("contact", "points", "integrator", "dt", "save_every", "transient", "duration")
 CHUNK = 262_144  # numbers of a chunk: what one write of a growing run touches
 
 
@@ -68,20 +70,24 @@ def write_constants(group: Any, radius: Floats, box: Floats) -> None:
 
 def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> Any:
     """Open the group of a run; `InputError` where the folder is none."""
+    check_run_store(path)
     try:
         group = zarr.open_group(zarr.storage.LocalStore(path, read_only=mode == "r"), mode=mode)
-        known = group.attrs.get("format") == "cellquant run" and "box" in group
-    except (OSError, ValueError, KeyError, json.JSONDecodeError) as error:
+        attributes: dict[str, Any] = dict(group.attrs)
+        Scene.from_dict(dict(attributes["scene"]))
+        missing = set(_SETTINGS) - set(attributes["settings"])
+        if missing or "status" not in attributes:
+            raise ValueError("its settings are not complete")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{path} is not a readable run ({str(error).splitlines()[0]}); "
+            f"{path} is not a readable run ({_first_line(error)}); "
             "make one with 'cellquant simulate -o RUN.zarr'."
         ) from error
-    if not known:
-        raise InputError(
-            f"{path} is a zarr group but no run of cellquant, or its first frame was not written "
-            "yet; make one with 'cellquant simulate -o RUN.zarr'."
-        )
     return group
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 def append_frames(group: Any, start: int, times: Floats, states: Floats) -> None:
@@ -99,21 +105,18 @@ def append_frames(group: Any, start: int, times: Floats, states: Floats) -> None
 
 
 def write_checkpoint(path: Path, **arrays: Any) -> None:
-    """Replace the checkpoint of a run in one move."""
-    partial = path / (CHECKPOINT + ".partial")
-    with open(partial, "wb") as file:
-        np.savez(file, **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path / CHECKPOINT)
+    """Replace the checkpoint of a run in one move, once the frames it counts on are on the disk."""
+    for chunk in path.glob("*/c/**/*"):
+        if chunk.is_file():
+            with open(chunk, "rb") as file:
+                os.fsync(file.fileno())
+    with atomic_path(path / CHECKPOINT) as partial:
+        np.savez(partial, **arrays)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
     """Read the checkpoint of a run, None where there is none."""
-    if not (path / CHECKPOINT).is_file():
-        return None
-    with np.load(path / CHECKPOINT, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+    return read_arrays(path / CHECKPOINT) if (path / CHECKPOINT).is_file() else None
 
 
 @dataclass(frozen=True)
@@ -205,7 +208,7 @@ class Run:
     @cached_property
     def time(self) -> Floats:
         """(T,) time of the frames since the end of the transient, t0."""
-        times = np.asarray(self._group["time"][:], np.float64)
+        times = self._read("time", slice(None))
         return times[: int(np.argmax(np.isnan(times)))] if np.isnan(times).any() else times
 
     @property
@@ -226,12 +229,12 @@ class Run:
     @cached_property
     def radius(self) -> Floats:
         """(N,) radii R0_i, L0."""
-        return np.asarray(self._group["radius"][:], np.float64)
+        return self._read("radius", slice(None))
 
     @cached_property
     def box(self) -> tuple[float, float]:
         """Edges of the periodic box, L0."""
-        edges = np.asarray(self._group["box"][:], np.float64)
+        edges = self._read("box", slice(None))
         return float(edges[0]), float(edges[1])
 
     @property
@@ -239,15 +242,24 @@ class Run:
         """Packing fraction sum(pi R0_i^2) / (Lx Ly)."""
         return float(np.sum(math.pi * self.radius**2)) / (self.box[0] * self.box[1])
 
+    def _read(self, name: str, where: slice | int) -> Floats:
+        try:
+            return np.asarray(self._group[name][where], np.float64)
+        except Exception as error:  # whatever a decoder calls it
+            raise InputError(
+                f"{self.path or 'the run'}: {name} cannot be decoded ({_first_line(error)}); the "
+                "run is damaged: simulate it again."
+            ) from error
+
     def _frames(self, name: str) -> Floats:
-        return np.asarray(self._group[name][: self.n_frames], np.float64)
+        return self._read(name, slice(self.n_frames))
 
     def state(self, frame: int) -> Floats:
         """State rows x, y, theta, a_2 .. a_M, b_2 .. b_M of one frame."""
         frame = range(self.n_frames)[frame]
-        modes = np.asarray(self._group["modes"][frame], np.float64)
-        polarity = np.asarray(self._group["polarity"][frame], np.float64)
-        position = np.asarray(self._group["position"][frame], np.float64)
+        modes = self._read("modes", frame)
+        polarity = self._read("polarity", frame)
+        position = self._read("position", frame)
         return np.column_stack([position, polarity, modes.reshape(len(modes), -1)])
 
     def mean_shape_index(self) -> Floats:

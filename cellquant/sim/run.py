@@ -27,6 +27,7 @@ from cellquant.sim.integrators import find_method, recommended
 from cellquant.sim.scene import Scene, SimulationFailure
 from cellquant.sim.shapes import pinched
 from cellquant.sim.steps import AdaptiveSteps, FixedSteps, Plan
+from cellquant.storage import atomic_path
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -173,10 +174,19 @@ class _Simulation:
         self.buffer: list[tuple[float, Floats]] = []
         stored = self._resume()
         if stored is None:
-            self.group = create_group(self.path, scene, settings)
-            write_constants(self.group, radius, box)
+            self.group = self._create(radius, box)
             self.written = 0
         self.run_object = Run(self.group, self.path)
+
+    def _create(self, radius: Floats, box: Floats) -> Any:
+        """Make the run whole or not at all, so that a kill leaves nothing to trip over."""
+        if self.path is None:
+            group = create_group(None, self.scene, self.settings)
+            write_constants(group, radius, box)
+            return group
+        with atomic_path(self.path) as temporary:
+            write_constants(create_group(temporary, self.scene, self.settings), radius, box)
+        return open_group(self.path, "r+")
 
     def _resume(self) -> dict[str, Any] | None:
         """Go back to the checkpoint of an earlier run at the same path."""
