@@ -1,12 +1,13 @@
-"""What a link is worth: motion, shape, births and deaths, calibrated on the movie itself."""
+"""What a link is worth: motion and shape, calibrated on the movie itself."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cellquant.track.fates import Fates
 from cellquant.track.kernels import neighbour_mean, pair_gains
-from cellquant.track.movie import LOG_AREA, NEAR, BoolArray, FloatArray, IntArray, Movie
+from cellquant.track.movie import NEAR, FloatArray, IntArray, Links, Movie
 
 KINDS = 4  # no path, path after, path before, path on both sides
 TERMS = 7
@@ -16,25 +17,6 @@ _SHAPE_FLOOR = 0.05
 _PRIOR_LINKS = 10.0
 _FIT_LINKS = 10000  # links that a fit looks at, evenly taken
 _PRIOR_SCALE = 0.15  # of the spacing
-_PRIOR_EVENTS = 2.0
-_PRIOR_RATE = 0.01
-_UNBORN = 0.2
-_PRIOR_SIZES = 20.0
-_SIZE_FLOOR = 0.05
-
-
-@dataclass(frozen=True)
-class Links:
-    """Who follows whom, as indices into all cells; -1 where nobody does.
-
-    ``after`` (N,) the next cell, ``second`` (N,) the other daughter of a division, ``before``
-    (N,) the previous cell or the mother, ``confidence`` (N,) of the link that ends in the cell.
-    """
-
-    after: IntArray
-    second: IntArray
-    before: IntArray
-    confidence: FloatArray
 
 
 @dataclass(frozen=True)
@@ -80,23 +62,13 @@ class Shapes:
     constant: float
 
 
-@dataclass(frozen=True)
-class Rates:
-    """Chance per cell and frame pair to vanish, to appear, to divide; inside and at the edge."""
-
-    vanish: tuple[float, float]
-    appear: tuple[float, float]
-    divide: float
-    counts: dict[str, int] = field(default_factory=dict)
-
-
 def paths(movie: Movie, links: Links | None, flow: FloatArray, carried: FloatArray) -> Paths:
     """Collect displacements from links, or from the flow where there are none yet.
 
     carried (N, 2) is the flow of the frame before, at the cells that it reaches.
     """
     n = movie.n_cells
-    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
+    frames = movie.frame_index
     elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
     drift = np.zeros((len(movie.time), 2))
     per_frame = flow / elapsed[:, None]
@@ -167,7 +139,7 @@ def regressors(paths: Paths, source: IntArray, target: IntArray) -> FloatArray:
 
 def expected_steps(movie: Movie, paths: Paths, motion: Motion, *, own_path: bool) -> FloatArray:
     """Displacement (N, 2) to the next frame expected of each cell, its partner not yet known."""
-    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
+    frames = movie.frame_index
     elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
     kind = 2 * paths.has_before if own_path else np.zeros(movie.n_cells, dtype=np.int64)
     weight = motion.coefficients[kind]
@@ -192,7 +164,7 @@ def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Moti
     source = np.flatnonzero((links.after >= 0) & (links.second < 0))
     source = source[:: max(1, len(source) // _FIT_LINKS)]
     target = links.after[source]
-    frames = np.searchsorted(movie.start, source, side="right") - 1
+    frames = movie.frame_index[source]
     elapsed = (movie.time[frames + 1] - movie.time[frames]).astype(np.float64)
     step = movie.position[target] - movie.position[source]
     y = step / elapsed[:, None] - paths.drift[frames]
@@ -294,119 +266,6 @@ def _robust_covariance(values: FloatArray, weight: FloatArray) -> FloatArray:
     return np.asarray(covariance, dtype=np.float64)
 
 
-def near_edge(movie: Movie, flow: FloatArray) -> tuple[BoolArray, BoolArray]:
-    """Which cells may leave through the edge before the next frame, or came in since the last."""
-    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
-    reach = 0.75 * movie.spacing[frames]
-    width, height = movie.field_of_view
-    ahead = movie.position + flow
-    back = movie.position.copy()
-    drift = np.array([flow[movie.cells_of(i)].mean(axis=0) for i in range(len(movie.time))])
-    back[movie.start[1] :] -= drift[frames[movie.start[1] :] - 1]
-
-    def margin(point: FloatArray) -> FloatArray:
-        x, y = point[:, 0], point[:, 1]
-        return np.asarray(np.minimum.reduce([x, y, width - x, height - y]), dtype=np.float64)
-
-    leaving = np.minimum(margin(ahead), movie.margin) < reach
-    entering = np.minimum(margin(back), movie.margin) < reach
-    return leaving, entering
-
-
-def fit_rates(movie: Movie, links: Links | None, leaving: BoolArray, entering: BoolArray) -> Rates:
-    """Chances to vanish, appear and divide from counts, each with a weak prior."""
-    if links is None:
-        return Rates((0.02, 0.2), (0.02, 0.2), 0.005)
-    last, first = movie.start[-2], movie.start[1]
-    gone = (links.after < 0)[:last]
-    new = (links.before < 0)[first:]
-    split = (links.second >= 0)[:last]
-
-    def rate(event: BoolArray, among: BoolArray) -> float:
-        count = float(np.sum(event & among)) + _PRIOR_EVENTS
-        return float(min(count / (among.sum() + _PRIOR_EVENTS / _PRIOR_RATE), 0.5))
-
-    return Rates(
-        (rate(gone, ~leaving[:last]), rate(gone, leaving[:last])),
-        (rate(new, ~entering[first:]), rate(new, entering[first:])),
-        rate(split, np.ones(len(split), dtype=bool)),
-    )
-
-
-def suppose_divisions(rates: Rates) -> Rates:
-    """Rates for the first look for divisions: what appeared inside was mostly born there."""
-    born = rates.appear[0]
-    return Rates(rates.vanish, (_UNBORN * born, rates.appear[1]), born)
-
-
-@dataclass(frozen=True)
-class Fates:
-    """Log chance of every cell (N,) to stay, vanish and divide before the next frame, and to have
-    appeared since the last, per area."""
-
-    stay: FloatArray
-    vanish: FloatArray
-    divide: FloatArray
-    appear: FloatArray
-
-
-def fates(
-    movie: Movie, links: Links | None, rates: Rates, leaving: BoolArray, entering: BoolArray
-) -> Fates:
-    """Chances of each cell from the rates, and from the size of vanishing and dividing cells.
-
-    The logarithm of the area is normal among the cells of each fate, with a prior that makes them
-    look like any cell.
-    """
-    vanish = np.where(leaving, rates.vanish[1], rates.vanish[0])
-    appear = np.where(entering, rates.appear[1], rates.appear[0])
-    divide = np.full(movie.n_cells, rates.divide)
-    stay = np.maximum(1.0 - vanish - divide, 0.1)
-    if links is not None:
-        size = movie.shape[:, LOG_AREA]
-        cell, last, first = np.arange(movie.n_cells), movie.start[-2], movie.start[1]
-        # Cells cut by the edge have no size of their own.
-        whole = ~movie.cut
-        gone = (cell < last) & (links.after < 0) & whole
-        split = (cell < last) & (links.second >= 0) & whole
-        new = (cell >= first) & (links.before < 0) & whole
-        usual = _size_law(size[(cell < last) & whole & ~gone & ~split], None)
-        vanish = vanish * np.where(whole, _size_ratio(size, size[gone], usual), 1.0)
-        divide = divide * np.where(whole, _size_ratio(size, size[split], usual), 1.0)
-        total = stay + vanish + divide
-        stay, vanish, divide = stay / total, vanish / total, divide / total
-        seen = np.where(whole, _size_ratio(size, size[new], usual), 1.0)
-        appear = np.minimum(appear * seen, 0.5)
-    return Fates(
-        np.log(np.maximum(stay, 1e-6)),
-        np.log(np.maximum(vanish, 1e-9)),
-        np.log(np.maximum(divide, 1e-12)),
-        np.log(appear * movie.density),
-    )
-
-
-def _size_law(values: FloatArray, prior: tuple[float, float] | None) -> tuple[float, float]:
-    """Mean and width of sizes, drawn towards the prior; robust where there is none."""
-    if prior is None:
-        mean = float(np.median(values)) if len(values) else 0.0
-        width = 1.4826 * float(np.median(np.abs(values - mean))) if len(values) else 1.0
-        return mean, max(width, _SIZE_FLOOR)
-    n = len(values) + _PRIOR_SIZES
-    mean = (float(values.sum()) + _PRIOR_SIZES * prior[0]) / n
-    square = float(np.sum((values - mean) ** 2))
-    square += _PRIOR_SIZES * (prior[1] ** 2 + (prior[0] - mean) ** 2)
-    return mean, max(float(np.sqrt(square / n)), _SIZE_FLOOR)
-
-
-def _size_ratio(size: FloatArray, among: FloatArray, usual: tuple[float, float]) -> FloatArray:
-    """How much likelier each size (N,) is among some cells than usual, within a factor of 20."""
-    mean, width = _size_law(among, usual)
-    near, far = (size - mean) / width, (size - usual[0]) / usual[1]
-    odds = 3.0 * (np.log1p(far**2 / 5.0) - np.log1p(near**2 / 5.0)) + np.log(usual[1] / width)
-    ratio: FloatArray = np.exp(np.clip(odds, -3.0, 3.0))
-    return ratio
-
-
 def gains(
     movie: Movie,
     candidates: IntArray,
@@ -417,7 +276,7 @@ def gains(
     max_distance: float,
 ) -> FloatArray:
     """Log odds (N, K) of the candidate links."""
-    frames = np.repeat(np.arange(len(movie.time)), np.diff(movie.start))
+    frames = movie.frame_index
     elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
     gain = np.empty(candidates.shape)
     around = np.stack(

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from cellquant.track.fates import INSIDE
 from cellquant.track.movie import Movie
 from cellquant.track.solve import Solution
 
@@ -73,8 +74,8 @@ def _reach(movie: Movie, solution: Solution, scale: float, tail: float) -> tuple
     """Distance from the prediction at which a link inside loses to vanishing and appearing."""
     rates = solution.rates
     density = float(np.median(movie.density))
-    best = -np.log(2 * np.pi * scale**2) + np.log1p(-rates.vanish[0])
-    best -= np.log(rates.vanish[0] * rates.appear[0] * density)
+    vanish, appear = rates.vanish[:-1, INSIDE].mean(), rates.appear[1:, INSIDE].mean()
+    best = -np.log(2 * np.pi * scale**2) + np.log1p(-vanish) - np.log(vanish * appear * density)
     spread = np.expm1(max(float(best), 0.0) / (tail / 2 + 1))
     return float(scale * np.sqrt(tail * spread)), float(np.median(movie.spacing))
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cellquant.track.costs import Links
 from cellquant.track.kernels import division_gains
-from cellquant.track.movie import LOG_AREA, FloatArray, IntArray, Movie
+from cellquant.track.movie import LOG_AREA, FloatArray, IntArray, Links, Movie
 
 _PRIOR_DIVISIONS = 10.0
 _PER_MOTHER = 3
@@ -18,7 +17,8 @@ _LEAST = 6.0
 class Divisions:
     """Log-normal daughters: mean and deviation of each quantity.
 
-    ``separation`` of the logarithm of the daughters' distance; ``total`` of the logarithm of
+    ``separation`` of the logarithm of the daughters' distance over the root of their summed area;
+    ``total`` of the logarithm of
     their summed area over the mother's; ``uneven`` deviation of the logarithm of their ratio;
     ``informative``
     chance that these sizes say more than those of any two cells; ``stretch`` (3, 3) elongation of
@@ -36,8 +36,14 @@ class Divisions:
     width: float
 
 
-def fit_divisions(movie: Movie, links: Links | None, middle: FloatArray, width: float) -> Divisions:
-    """Estimate the daughters' geometry from the divisions found, with a weak general prior."""
+def fit_divisions(
+    movie: Movie, links: Links | None, middle: FloatArray, width: float, tail: float
+) -> Divisions:
+    """Estimate the daughters' geometry from the divisions found, with a weak general prior.
+
+    `width` and `tail` are those of single cells' steps around `middle` (N, 2), where they are
+    expected.
+    """
     area = movie.shape[:, LOG_AREA]
     centre = float(np.median(area))
     spread = max(1.4826 * float(np.median(np.abs(area - centre))), 0.1)
@@ -49,8 +55,9 @@ def fit_divisions(movie: Movie, links: Links | None, middle: FloatArray, width: 
     one, two = (
         (links.after[mothers], links.second[mothers]) if links is not None else (mothers, mothers)
     )
-    apart = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T))
-    total = np.logaddexp(area[one], area[two]) - area[mothers]
+    both = np.logaddexp(area[one], area[two])
+    apart = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T)) - both / 2
+    total = both - area[mothers]
     ratio = area[one] - area[two]
     place = (movie.position[one] + movie.position[two]) / 2 - middle[mothers]
     total_fit = _normal(total, 0.3, 0.35, 0.1)
@@ -64,19 +71,24 @@ def fit_divisions(movie: Movie, links: Links | None, middle: FloatArray, width: 
         share = informative * ratio_of / (informative * ratio_of + 1.0 - informative)
         informative = (float(share.sum()) + 1.0) / (len(mothers) + 2.0)
     return Divisions(
-        separation=_normal(apart, np.log(0.85 * spacing), 0.35, 0.1),
+        separation=_normal(apart, np.log(0.85 * spacing) - centre / 2 - 0.15, 0.3, 0.1),
         total=total_fit,
         uneven=uneven,
         informative=informative,
         stretch=_fit_stretch(movie, mothers, one, two),
         population=population,
-        width=float(
-            np.sqrt(
-                (np.sum(place**2) / 2 + _PRIOR_DIVISIONS * (1.5 * width) ** 2)
-                / (len(mothers) + _PRIOR_DIVISIONS)
-            )
-        ),
+        width=_robust_width(np.sum(place**2, axis=1), 1.5 * width, tail),
     )
+
+
+def _robust_width(square: FloatArray, prior: float, tail: float) -> float:
+    """Scale of a two-dimensional Student density from squared distances (D,)."""
+    width = prior
+    for _ in range(10):
+        weight = (tail + 2.0) / (tail + square / width**2)
+        total = np.sum(weight * square) / 2 + _PRIOR_DIVISIONS * prior**2
+        width = float(np.sqrt(total / (len(square) + _PRIOR_DIVISIONS)))
+    return width
 
 
 def _fit_stretch(movie: Movie, mothers: IntArray, one: IntArray, two: IntArray) -> FloatArray:

@@ -66,7 +66,7 @@ def _candidates(
     values: list[FloatArray] = []
     spans: list[IntArray] = []
     n_frames = len(movie.time)
-    frame_of = np.searchsorted(movie.start, np.arange(movie.n_cells), side="right") - 1
+    frame_of = movie.frame_index
     for index in range(n_frames - 2):
         ends = ends_all[frame_of[ends_all] == index]
         if len(ends) == 0:

@@ -270,7 +270,8 @@ def division_gains(
     """Log odds of divisions with at least one daughter that has no sure mother; their number.
 
     The middle of the daughters stays near the predicted place (Student density), their distance
-    is log-normal, and so are the sum of their areas against the mother's and their ratio, unless
+    against their size is log-normal, and so are the sum of their areas against the mother's and
+    their ratio, unless
     (with chance 1 - ratios[3]) their sizes tell nothing. Mother and daughters are elongated along
     their line by `stretch` (mother, daughters, any cell: mean, width along, width across).
     Writes (mother, column and column of the daughters among its candidates), as many as fit.
@@ -296,11 +297,11 @@ def division_gains(
                 w = width[i]
                 value = -np.log(2 * np.pi * w * w)
                 value -= (tail / 2 + 1) * np.log1p((mx * mx + my * my) / (w * w * tail))
-                z = (np.log(apart) - separation[0]) / separation[1]
+                both = np.log(np.exp(shape[j, 0]) + np.exp(shape[h, 0]))
+                z = (np.log(apart) - both / 2 - separation[0]) / separation[1]
                 value -= 0.5 * z * z + np.log(separation[1] * np.sqrt(2 * np.pi))
                 value -= np.log(2 * np.pi * apart * apart)
-                both = np.log(np.exp(shape[j, 0]) + np.exp(shape[h, 0])) - shape[i, 0]
-                z = (both - ratios[0]) / ratios[1]
+                z = (both - shape[i, 0] - ratios[0]) / ratios[1]
                 sizes = -0.5 * z * z - np.log(2 * np.pi * ratios[1] * ratios[2])
                 z = (shape[j, 0] - shape[h, 0]) / ratios[2]
                 sizes -= 0.5 * z * z

@@ -13,6 +13,8 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 NEAR, WIDE = 6, 18  # neighbours that carry the local flow, at two scales
+_RING = 8  # neighbours that surround a cell inside the layer
+_OPEN_ANGLE = 0.8 * np.pi
 LOG_AREA = 0  # column of Movie.shape
 
 
@@ -46,6 +48,10 @@ class Movie:
         (N,) distance to the edge of the field of view.
     cut
         (N,) whether the cell touches that edge, so that its shape is not its own.
+    rim
+        (N,) whether the cell lies at the rim of the layer: no neighbour on one side.
+    frame_index
+        (N,) index of the cell's frame in `time`.
     """
 
     position: FloatArray
@@ -59,6 +65,8 @@ class Movie:
     density: FloatArray
     margin: FloatArray
     cut: BoolArray
+    rim: BoolArray
+    frame_index: IntArray
     field_of_view: tuple[float, float]
 
     @property
@@ -69,6 +77,20 @@ class Movie:
     def cells_of(self, index: int) -> slice:
         """Range of the cells in the frame of this index."""
         return slice(int(self.start[index]), int(self.start[index + 1]))
+
+
+@dataclass(frozen=True)
+class Links:
+    """Who follows whom, as indices into all cells; -1 where nobody does.
+
+    ``after`` (N,) the next cell, ``second`` (N,) the other daughter of a division, ``before``
+    (N,) the previous cell or the mother, ``confidence`` (N,) of the link that ends in the cell.
+    """
+
+    after: IntArray
+    second: IntArray
+    before: IntArray
+    confidence: FloatArray
 
 
 def flatten(cells: Cells) -> Movie:
@@ -110,6 +132,8 @@ def flatten(cells: Cells) -> Movie:
         density=density,
         margin=margin,
         cut=table["touches_border"].to_numpy(np.bool_),
+        rim=_at_rim(position, neighbours[:, :_RING]),
+        frame_index=np.repeat(np.arange(len(time)), np.diff(start)),
         field_of_view=(width, height),
     )
 
@@ -130,6 +154,17 @@ def _surroundings(position: FloatArray, area: float) -> tuple[IntArray, float, F
         spacing = float(np.sqrt(area / n))
     reach = np.maximum(distance[:, min(k, NEAR)], spacing / 2)
     return found, spacing, np.maximum(min(k, NEAR) / (np.pi * reach**2), 1.0 / area)
+
+
+def _at_rim(position: FloatArray, neighbours: IntArray) -> BoolArray:
+    """Whether the nearest cells (N, k) leave a wide angle free."""
+    if len(position) == 0 or neighbours.shape[1] == 0:
+        return np.ones(len(position), dtype=np.bool_)
+    step = position[neighbours] - position[:, None]
+    angle = np.sort(np.arctan2(step[..., 1], step[..., 0]), axis=1)
+    gap = np.diff(angle, axis=1, append=angle[:, :1] + 2.0 * np.pi)
+    wide: BoolArray = gap.max(axis=1) > _OPEN_ANGLE
+    return wide
 
 
 def _descriptors(cells: Cells) -> FloatArray:

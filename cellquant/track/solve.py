@@ -8,30 +8,24 @@ import numpy as np
 
 from cellquant.track.assign import match_with_divisions
 from cellquant.track.costs import (
-    Fates,
-    Links,
     Motion,
     Paths,
-    Rates,
     Shapes,
     carried_flow,
     expected_steps,
-    fates,
     first_motion,
     fit_motion,
-    fit_rates,
     fit_shapes,
     gains,
-    near_edge,
     paths,
-    suppose_divisions,
 )
 from cellquant.track.cues import Cue, fit_cue
 from cellquant.track.divisions import Divisions, fit_divisions, propose
+from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
 from cellquant.track.flow import CANDIDATES, all_flows, nearest_cells
 from cellquant.track.images import CONTEXTS, PairImages
 from cellquant.track.kernels import marginals
-from cellquant.track.movie import BoolArray, FloatArray, IntArray, Movie
+from cellquant.track.movie import BoolArray, FloatArray, IntArray, Links, Movie
 
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
@@ -65,8 +59,8 @@ class Solution:
     flow: FloatArray
     carried: FloatArray
     candidates: IntArray
-    leaving: BoolArray
-    entering: BoolArray
+    leaving: IntArray
+    entering: IntArray
     known: Paths
     motion: Motion
     shapes: Shapes
@@ -135,7 +129,11 @@ def solve(
         middle = movie.position + expected_steps(movie, state.known, state.motion, own_path=False)
         if options.divisions and turn >= _DIVISION_PASS:
             state.divisions = fit_divisions(
-                movie, state.links, middle, float(state.motion.scale[0])
+                movie,
+                state.links,
+                middle,
+                float(state.motion.scale[0]),
+                float(state.motion.tail[0]),
             )
         state.links = _assign(state, middle, images)
         if progress is not None:
@@ -150,7 +148,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
         found = nearest_cells(movie.position[a] + flow[a], movie.position[b])
         candidates[a] = np.where(found >= 0, found + movie.start[index + 1], -1)
-    leaving, entering = near_edge(movie, flow)
+    leaving, entering = places(movie, flow)
     carried = carried_flow(movie, flow)
     none = np.empty(0, dtype=np.int64)
     return Solution(
