@@ -12,6 +12,8 @@ from cellquant.track.movie import NEAR, FloatArray, IntArray, Links, Movie
 KINDS = 4  # no path, path after, path before, path on both sides
 TERMS = 7
 _TAILS = (4.0, 6.0, 8.0, 12.0)  # heavier ones would make room for wrong links
+_PRIOR_FRAME, _PRIOR_STIRRED = 20.0, 50.0  # links that say that frames and places are alike
+_SPREAD = (0.2, 5.0)
 _SHAPE_TAIL = 5.0
 _SHAPE_FLOOR = 0.05
 _PRIOR_LINKS = 10.0
@@ -44,11 +46,14 @@ class Motion:
     ``coefficients`` (4, 7) of: neighbours now near, neighbours now wide, neighbours before,
     neighbours of the partner now, neighbours of the partner next, own step before, partner's
     step next. ``scale`` (4,) and ``tail`` (4,) of the two-dimensional Student density.
+    ``spread`` (N,) says how many times wider it is at each cell: in its frame, and where cells
+    die or divide beside it.
     """
 
     coefficients: FloatArray
     scale: FloatArray
     tail: FloatArray
+    spread: FloatArray
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ def paths(movie: Movie, links: Links | None, flow: FloatArray, carried: FloatArr
     """
     n = movie.n_cells
     frames = movie.frame_index
-    elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
+    elapsed = movie.elapsed
     drift = np.zeros((len(movie.time), 2))
     per_frame = flow / elapsed[:, None]
     own_after, own_before = np.zeros((n, 2)), np.zeros((n, 2))
@@ -140,7 +145,7 @@ def regressors(paths: Paths, source: IntArray, target: IntArray) -> FloatArray:
 def expected_steps(movie: Movie, paths: Paths, motion: Motion, *, own_path: bool) -> FloatArray:
     """Displacement (N, 2) to the next frame expected of each cell, its partner not yet known."""
     frames = movie.frame_index
-    elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
+    elapsed = movie.elapsed
     kind = 2 * paths.has_before if own_path else np.zeros(movie.n_cells, dtype=np.int64)
     weight = motion.coefficients[kind]
     # What the partner's neighbourhood does now is what the own neighbourhood does now.
@@ -151,12 +156,13 @@ def expected_steps(movie: Movie, paths: Paths, motion: Motion, *, own_path: bool
     return expected
 
 
-def first_motion(spacing: float) -> Motion:
+def first_motion(movie: Movie) -> Motion:
     """The motion model before anything is known: neighbours move alike."""
+    spacing = float(np.median(movie.spacing))
     coefficients = np.zeros((KINDS, TERMS))
     coefficients[:, 0] = 0.5
     coefficients[:, 1] = 0.5
-    return Motion(coefficients, np.full(KINDS, _PRIOR_SCALE * spacing), np.full(KINDS, 4.0))
+    return Motion(coefficients, np.full(KINDS, _PRIOR_SCALE * spacing), np.full(KINDS, 4.0), np.ones(movie.n_cells))
 
 
 def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Motion:
@@ -165,12 +171,15 @@ def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Moti
     source = source[:: max(1, len(source) // _FIT_LINKS)]
     target = links.after[source]
     frames = movie.frame_index[source]
-    elapsed = (movie.time[frames + 1] - movie.time[frames]).astype(np.float64)
+    elapsed = movie.elapsed[source]
     step = movie.position[target] - movie.position[source]
     y = step / elapsed[:, None] - paths.drift[frames]
     x = regressors(paths, source, target)
     # A cell's own link is part of the neighbourhood of its neighbours only, never of its own.
-    weight = links.confidence[target] * np.sqrt(elapsed)
+    weight = links.confidence[target]
+    # Residuals grow as the root of time; in these units all have the same scatter.
+    unit = 1.0 / (before.spread[source] / np.sqrt(elapsed))
+    x, y = x * unit[:, None, None], y * unit[:, None]
     has_before, has_after = paths.has_before[source] == 1, paths.has_after[target] == 1
     coefficients, scale, tail = before.coefficients.copy(), before.scale.copy(), before.tail.copy()
     spacing = float(np.median(movie.spacing))
@@ -189,7 +198,40 @@ def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Moti
         found = _student_fit(x[use][:, terms], y[use], weight[use], before.scale[kind], spacing)
         coefficients[kind] = 0.0
         coefficients[kind, terms], scale[kind], tail[kind] = found
-    return Motion(coefficients, scale, tail)
+    kind = 2 * paths.has_before[source] + paths.has_after[target]
+    rest = y - np.einsum("ltd,lt->ld", x, coefficients[kind])
+    square = np.sum(rest**2, axis=1) * before.spread[source] ** 2 / scale[kind] ** 2
+    stirred = _stirred(movie, links)
+    spread = _spread(square, weight, tail[kind], movie.frame_index[source], stirred[source])
+    return Motion(coefficients, scale, tail, spread[movie.frame_index, stirred])
+
+
+def _stirred(movie: Movie, links: Links) -> IntArray:
+    """1 for the cells (N,) beside one that vanishes or divides before the next frame."""
+    event = (links.after < 0) | (links.second >= 0)
+    found: IntArray = event[movie.neighbours[:, :NEAR]].any(axis=1).astype(np.int64)
+    return found
+
+
+def _spread(
+    square: FloatArray, weight: FloatArray, tail: FloatArray, frame: IntArray, stirred: IntArray
+) -> FloatArray:
+    """Factors (P, 2) on the scale for each frame, calm and stirred.
+
+    square (L,) are residuals over the scale, squared. Both kinds of factor come from robust
+    scatter, each drawn towards 1.
+    """
+    by_frame, by_stir = np.ones(frame.max(initial=0) + 2), np.ones(2)
+    for _ in range(8):
+        for factor, group, prior in (
+            (by_stir, stirred, _PRIOR_STIRRED),
+            (by_frame, frame, _PRIOR_FRAME),
+        ):
+            width = (by_frame[frame] * by_stir[stirred]) ** 2
+            robust = weight * (tail + 2.0) / (tail + square / width) * square / width / 2
+            top = np.bincount(group, robust, len(factor)) + prior
+            factor *= np.sqrt(top / (np.bincount(group, weight, len(factor)) + prior))
+    return np.clip(by_frame[:, None] * by_stir, *_SPREAD)
 
 
 def _student_fit(
@@ -277,7 +319,7 @@ def gains(
 ) -> FloatArray:
     """Log odds (N, K) of the candidate links."""
     frames = movie.frame_index
-    elapsed = np.append(np.diff(movie.time), 1)[frames].astype(np.float64)
+    elapsed = movie.elapsed
     gain = np.empty(candidates.shape)
     around = np.stack(
         (paths.around_after[:, 0], paths.around_after[:, 1], paths.around_before[:, 0]), axis=1
@@ -289,6 +331,7 @@ def gains(
         movie.cut,
         candidates,
         elapsed,
+        motion.spread * np.sqrt(elapsed),
         paths.own_before,
         paths.own_after,
         paths.has_before,

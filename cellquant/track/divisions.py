@@ -133,6 +133,7 @@ def propose(
     orphan: IntArray,
     middle: FloatArray,
     model: Divisions,
+    spread: FloatArray,
     tail: float,
     log_rate: FloatArray,
     leave: FloatArray,
@@ -148,7 +149,6 @@ def propose(
     least = -_LEAST  # an image cue can still speak for it
     cells = np.empty((limit, 3), dtype=np.int64)
     gain = np.empty(limit)
-    elapsed = float(movie.time[index + 1] - movie.time[index])
     found = division_gains(
         movie.position,
         movie.shape,
@@ -156,7 +156,7 @@ def propose(
         candidates,
         orphan,
         middle,
-        np.full(movie.n_cells, model.width * np.sqrt(elapsed)),
+        model.width * spread,
         tail,
         np.array(model.separation),
         np.array([*model.total, model.uneven, model.informative]),

@@ -159,6 +159,7 @@ def pair_gains(
     cut: BoolArray,
     candidates: IntArray,
     elapsed: FloatArray,
+    spread: FloatArray,
     own_before: FloatArray,
     own_after: FloatArray,
     has_before: IntArray,
@@ -217,7 +218,7 @@ def pair_gains(
             if has_after[j]:
                 rx -= b[6] * own_after[j, 0]
                 ry -= b[6] * own_after[j, 1]
-            width = scale[kind] * np.sqrt(elapsed[i])
+            width = scale[kind] * spread[i]
             nu = tail[kind]
             distance = (rx * rx + ry * ry) * elapsed[i] * elapsed[i] / (width * width * nu)
             value = -np.log(2 * np.pi * width * width) - (nu / 2 + 1) * np.log1p(distance)

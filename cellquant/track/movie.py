@@ -52,6 +52,8 @@ class Movie:
         (N,) whether the cell lies at the rim of the layer: no neighbour on one side.
     frame_index
         (N,) index of the cell's frame in `time`.
+    elapsed
+        (N,) frame numbers from the cell's frame to the next that holds cells; 1 in the last.
     """
 
     position: FloatArray
@@ -67,6 +69,7 @@ class Movie:
     cut: BoolArray
     rim: BoolArray
     frame_index: IntArray
+    elapsed: FloatArray
     field_of_view: tuple[float, float]
 
     @property
@@ -134,6 +137,7 @@ def flatten(cells: Cells) -> Movie:
         cut=table["touches_border"].to_numpy(np.bool_),
         rim=_at_rim(position, neighbours[:, :_RING]),
         frame_index=np.repeat(np.arange(len(time)), np.diff(start)),
+        elapsed=np.repeat(np.append(np.diff(time), 1), np.diff(start)).astype(np.float64),
         field_of_view=(width, height),
     )
 

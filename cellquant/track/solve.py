@@ -159,7 +159,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         entering=entering,
         carried=carried,
         known=_paths(movie, None, flow, carried, options),
-        motion=first_motion(float(np.median(movie.spacing))),
+        motion=first_motion(movie),
         shapes=fit_shapes(movie, none, none, np.empty(0)),
         rates=fit_rates(movie, None, leaving, entering),
     )
@@ -250,6 +250,7 @@ def _families(
         orphan,
         middle,
         state.divisions,
+        state.motion.spread * np.sqrt(state.movie.elapsed),
         float(state.motion.tail[0]),
         state.fates.divide,
         state.fates.vanish,
