@@ -162,7 +162,8 @@ def first_motion(movie: Movie) -> Motion:
     coefficients = np.zeros((KINDS, TERMS))
     coefficients[:, 0] = 0.5
     coefficients[:, 1] = 0.5
-    return Motion(coefficients, np.full(KINDS, _PRIOR_SCALE * spacing), np.full(KINDS, 4.0), np.ones(movie.n_cells))
+    scale, tail = np.full(KINDS, _PRIOR_SCALE * spacing), np.full(KINDS, 4.0)
+    return Motion(coefficients, scale, tail, np.ones(movie.n_cells))
 
 
 def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Motion:
@@ -198,30 +199,36 @@ def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Moti
         found = _student_fit(x[use][:, terms], y[use], weight[use], before.scale[kind], spacing)
         coefficients[kind] = 0.0
         coefficients[kind, terms], scale[kind], tail[kind] = found
-    kind = 2 * paths.has_before[source] + paths.has_after[target]
-    rest = y - np.einsum("ltd,lt->ld", x, coefficients[kind])
-    square = np.sum(rest**2, axis=1) * before.spread[source] ** 2 / scale[kind] ** 2
+    kinds: IntArray = 2 * paths.has_before[source] + paths.has_after[target]
+    rest = y - np.einsum("ltd,lt->ld", x, coefficients[kinds])
+    square = np.sum(rest**2, axis=1) * before.spread[source] ** 2 / scale[kinds] ** 2
     stirred = _stirred(movie, links)
-    spread = _spread(square, weight, tail[kind], movie.frame_index[source], stirred[source])
+    spread = _spread(square, weight, tail[kinds], frames, stirred[source], len(movie.time))
     return Motion(coefficients, scale, tail, spread[movie.frame_index, stirred])
 
 
 def _stirred(movie: Movie, links: Links) -> IntArray:
     """1 for the cells (N,) beside one that vanishes or divides before the next frame."""
     event = (links.after < 0) | (links.second >= 0)
-    found: IntArray = event[movie.neighbours[:, :NEAR]].any(axis=1).astype(np.int64)
+    beside = event[movie.neighbours[:, :NEAR]]
+    found: IntArray = np.asarray(beside.any(axis=1), dtype=np.int64)
     return found
 
 
 def _spread(
-    square: FloatArray, weight: FloatArray, tail: FloatArray, frame: IntArray, stirred: IntArray
+    square: FloatArray,
+    weight: FloatArray,
+    tail: FloatArray,
+    frame: IntArray,
+    stirred: IntArray,
+    n_frames: int,
 ) -> FloatArray:
     """Factors (P, 2) on the scale for each frame, calm and stirred.
 
     square (L,) are residuals over the scale, squared. Both kinds of factor come from robust
     scatter, each drawn towards 1.
     """
-    by_frame, by_stir = np.ones(frame.max(initial=0) + 2), np.ones(2)
+    by_frame, by_stir = np.ones(n_frames), np.ones(2)
     for _ in range(8):
         for factor, group, prior in (
             (by_stir, stirred, _PRIOR_STIRRED),
@@ -229,9 +236,10 @@ def _spread(
         ):
             width = (by_frame[frame] * by_stir[stirred]) ** 2
             robust = weight * (tail + 2.0) / (tail + square / width) * square / width / 2
-            top = np.bincount(group, robust, len(factor)) + prior
-            factor *= np.sqrt(top / (np.bincount(group, weight, len(factor)) + prior))
-    return np.clip(by_frame[:, None] * by_stir, *_SPREAD)
+            top = factor**2 * np.bincount(group, robust, len(factor)) + prior
+            factor[:] = np.sqrt(top / (np.bincount(group, weight, len(factor)) + prior))
+    spread: FloatArray = np.clip(by_frame[:, None] * by_stir, *_SPREAD)
+    return spread
 
 
 def _student_fit(

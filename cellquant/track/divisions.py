@@ -18,13 +18,11 @@ class Divisions:
     """Log-normal daughters: mean and deviation of each quantity.
 
     ``separation`` of the logarithm of the daughters' distance over the root of their summed area;
-    ``total`` of the logarithm of
-    their summed area over the mother's; ``uneven`` deviation of the logarithm of their ratio;
-    ``informative``
-    chance that these sizes say more than those of any two cells; ``stretch`` (3, 3) elongation of
-    mother, daughters and any cell along the daughters' line, its width, and the width across;
-    ``population`` of all cells' areas;
-    ``width`` of the place of their middle.
+    ``total`` of the logarithm of their summed area over the mother's; ``uneven`` deviation of the
+    logarithm of their ratio; ``informative`` chance that these sizes say more than those of any
+    two cells; ``stretch`` (3, 3) elongation of mother, daughters and any cell along the daughters'
+    line, its width, and the width across; ``population`` of all cells' areas; ``width`` of the
+    place of their middle.
     """
 
     separation: tuple[float, float]

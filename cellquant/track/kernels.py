@@ -272,9 +272,9 @@ def division_gains(
 
     The middle of the daughters stays near the predicted place (Student density), their distance
     against their size is log-normal, and so are the sum of their areas against the mother's and
-    their ratio, unless
-    (with chance 1 - ratios[3]) their sizes tell nothing. Mother and daughters are elongated along
-    their line by `stretch` (mother, daughters, any cell: mean, width along, width across).
+    their ratio, unless (with chance 1 - ratios[3]) their sizes tell nothing. Mother and daughters
+    are elongated along their line by `stretch` (mother, daughters, any cell: mean, width along,
+    width across).
     Writes (mother, column and column of the daughters among its candidates), as many as fit.
     """
     k = candidates.shape[1]
