@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from cellquant.track.kernels import division_gains
 from cellquant.track.movie import LOG_AREA, FloatArray, IntArray, Links, Movie
@@ -11,6 +12,8 @@ _PRIOR_DIVISIONS = 10.0
 _PER_MOTHER = 3
 _STRETCH_FLOOR = 0.1
 _LEAST = 6.0
+_SIZE_BLUR = 0.1  # of the logarithm of the area
+_RARE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -21,8 +24,8 @@ class Divisions:
     ``total`` of the logarithm of their summed area over the mother's; ``uneven`` deviation of the
     logarithm of their ratio; ``informative`` chance that these sizes say more than those of any
     two cells; ``stretch`` (3, 3) elongation of mother, daughters and any cell along the daughters'
-    line, its width, and the width across; ``population`` of all cells' areas; ``width`` of the
-    place of their middle.
+    line, its width, and the width across; ``population`` (N,) log frequency of each
+    cell's size among all cells; ``width`` of the place of their middle.
     """
 
     separation: tuple[float, float]
@@ -30,7 +33,7 @@ class Divisions:
     uneven: float
     informative: float
     stretch: FloatArray
-    population: tuple[float, float]
+    population: FloatArray
     width: float
 
 
@@ -44,8 +47,7 @@ def fit_divisions(
     """
     area = movie.shape[:, LOG_AREA]
     centre = float(np.median(area))
-    spread = max(1.4826 * float(np.median(np.abs(area - centre))), 0.1)
-    population = (centre, spread)
+    population = _log_frequency(area)
     spacing = float(np.median(movie.spacing))
     mothers = np.empty(0, dtype=np.int64)
     if links is not None:
@@ -62,7 +64,7 @@ def fit_divisions(
     uneven = _normal(ratio, 0.0, 0.3, 0.1, fixed=True)[1]
     # How often the sizes of daughters are told better by these laws than by the population.
     family = _log_normal(total, *total_fit) + _log_normal(ratio, 0.0, uneven)
-    family -= _log_normal(area[one], *population) + _log_normal(area[two], *population)
+    family -= population[one] + population[two]
     ratio_of = np.exp(np.clip(family, -50.0, 50.0))
     informative = 0.5
     for _ in range(20):
@@ -117,6 +119,21 @@ def _normal(
     return centre, max(float(np.sqrt(variance)), floor)
 
 
+def _log_frequency(values: FloatArray) -> FloatArray:
+    """Log density (N,) of each value among all of them.
+
+    Counted, not assumed normal: a merged or broken cell is as rare as there are such cells, and
+    no more.
+    """
+    low, high = values.min() - 5 * _SIZE_BLUR, values.max() + 5 * _SIZE_BLUR
+    count, edges = np.histogram(
+        values, max(int((high - low) / (0.25 * _SIZE_BLUR)), 1), (low, high)
+    )
+    step = edges[1] - edges[0]
+    density = gaussian_filter1d(count / (len(values) * step), _SIZE_BLUR / step, mode="constant")
+    return np.log(np.interp(values, (edges[:-1] + edges[1:]) / 2, density) + _RARE)
+
+
 def _log_normal(values: FloatArray, mean: float, deviation: float) -> FloatArray:
     density: FloatArray = -0.5 * ((values - mean) / deviation) ** 2 - np.log(
         deviation * np.sqrt(2.0 * np.pi)
@@ -158,7 +175,7 @@ def propose(
         tail,
         np.array(model.separation),
         np.array([*model.total, model.uneven, model.informative]),
-        np.array(model.population),
+        model.population,
         model.stretch,
         log_rate,
         leave,

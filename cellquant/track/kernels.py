@@ -274,10 +274,11 @@ def division_gains(
     against their size is log-normal, and so are the sum of their areas against the mother's and
     their ratio, unless (with chance 1 - ratios[3]) their sizes tell nothing. Mother and daughters
     are elongated along their line by `stretch` (mother, daughters, any cell: mean, width along,
-    width across).
+    width across; Student density). population (N,) is the log density of sizes at each cell.
     Writes (mother, column and column of the daughters among its candidates), as many as fit.
     """
     k = candidates.shape[1]
+    nu = 5.0
     found = 0
     for i in range(first, last):
         for c in range(k):
@@ -306,9 +307,7 @@ def division_gains(
                 sizes = -0.5 * z * z - np.log(2 * np.pi * ratios[1] * ratios[2])
                 z = (shape[j, 0] - shape[h, 0]) / ratios[2]
                 sizes -= 0.5 * z * z
-                for g in (j, h):
-                    z = (shape[g, 0] - population[0]) / population[1]
-                    sizes += 0.5 * z * z + np.log(population[1] * np.sqrt(2 * np.pi))
+                sizes -= population[j] + population[h]
                 value += np.log(1.0 - ratios[3] + ratios[3] * np.exp(sizes))
                 # Elongation along and across the line between the daughters.
                 along = (dx * dx - dy * dy) / (apart * apart)
@@ -316,9 +315,10 @@ def division_gains(
                 for g, role in ((i, 0), (j, 1), (h, 1)):
                     e = along * shape[g, 1] + across * shape[g, 2]
                     o = along * shape[g, 2] - across * shape[g, 1]
-                    z = (e - stretch[role, 0]) / stretch[role, 1]
-                    value += 0.5 * ((e * e + o * o) / stretch[2, 1] ** 2 - z * z)
-                    value -= 0.5 * (o / stretch[role, 2]) ** 2
+                    near = ((e - stretch[role, 0]) / stretch[role, 1]) ** 2
+                    near += (o / stretch[role, 2]) ** 2
+                    far = (e * e + o * o) / stretch[2, 1] ** 2
+                    value += (nu / 2 + 1) * (np.log1p(far / nu) - np.log1p(near / nu))
                     value += np.log(stretch[2, 1] ** 2 / (stretch[role, 1] * stretch[role, 2]))
                 value += prior[i] - leave[i] - appear[j] - appear[h]
                 if value > least and found < len(out_gain):
