@@ -365,9 +365,10 @@ def show(line: dict) -> None:
 
 
 TITLES = {
-    "scores": "Scores. Labels shuffled per frame, defaults only; the search range of the peers is "
-    "the best of four (0.35 to 1 spacing) per set, chosen on the truth; wider ranges and a drift "
-    "prediction lift LapTrack to 0.565 and trackpy to 0.747 at every 7th frame",
+    "scores": "Scores on the recordings looked at during development. Labels shuffled per frame, "
+    "defaults only; the search range of the peers is the best of four (0.35 to 1 spacing) per set, "
+    "chosen on the truth; wider ranges and a drift prediction lift LapTrack to 0.565 "
+    "and trackpy to 0.747 at every 7th frame",
     "ablation": "What each cue brings, and its CPU time (gaps left open)",
     "motion": "Edge F1 against root mean square step over cell diameter (crowded layers of 500 "
     "cells, no divisions; peers with the best of four search ranges)",

@@ -18,8 +18,11 @@ from cellquant.io import LabelStack, read_images, read_labels
 from cellquant.tables import PIXEL, TRACK_COLUMNS, Cells
 from cellquant.track import track_cells
 from cellquant.track.assign import match, match_with_divisions
+from cellquant.track.divisions import log_frequency
 from cellquant.track.evaluate import evaluate
 from cellquant.track.kernels import marginals
+from cellquant.track.movie import flatten
+from cellquant.track.solve import Options, solve
 
 
 def discs(paths: np.ndarray, *, size: int = 120, radius: float = 3.2) -> np.ndarray:
@@ -282,6 +285,37 @@ def test_match_with_divisions_prefers_the_better_explanation() -> None:
     assert len(split) == 0
 
 
+def test_rare_sizes_are_as_rare_as_they_occur() -> None:
+    """A handful of merged cells must not look impossible, or anything would explain them better."""
+    sizes = np.random.default_rng(0).normal(scale=0.1, size=2000)
+    sizes[:20] += np.log(2.0)
+    log_density = log_frequency(sizes)
+    normal = -0.5 * (sizes / 0.1) ** 2 - np.log(0.1 * np.sqrt(2 * np.pi))
+    assert normal[:20].max() < -10.0
+    assert (log_density[:20] > -7.0).all()
+    assert np.median(np.abs(log_density[20:] - normal[20:])) < 0.5
+
+
+def test_steps_scatter_more_in_a_frame_with_a_jolt() -> None:
+    rng = np.random.default_rng(0)
+    start = np.array([(x, y) for y in range(10, 250, 12) for x in range(10, 250, 12)], dtype=float)
+    scale = np.array([0.3, 0.3, 1.5, 0.3, 0.3])
+    steps = rng.normal(size=(5, len(start), 2)) * scale[:, None, None]
+    paths = np.concatenate((start[None], start + np.cumsum(steps, axis=0)))
+    cells = replace(cells_at(list(paths)), field_of_view=(260.0, 260.0))
+    solution = solve(flatten(cells), Options())
+    spread = [float(np.median(solution.motion.spread[i * 400 : (i + 1) * 400])) for i in range(5)]
+    assert spread[2] > 2.0 * max(spread[i] for i in (0, 1, 3, 4))
+
+
+def test_cells_at_the_rim_of_a_layer_are_known() -> None:
+    points = np.array([(x, y) for y in range(40, 70, 5) for x in range(40, 70, 5)], dtype=float)
+    rim = flatten(cells_at([points, points])).rim[: len(points)]
+    inside = ((points > 40.0) & (points < 65.0)).all(axis=1)
+    assert not rim[inside].any()
+    assert rim[~inside].all()
+
+
 def test_marginals_of_one_pair_are_its_odds() -> None:
     out = np.empty((1, 1))
     marginals(np.array([[1.5]]), np.array([[0]]), 1, 6, out)
@@ -305,7 +339,7 @@ def test_twenty_thousand_cells_per_frame_stay_bounded() -> None:
 
 @pytest.mark.parametrize(
     ("name", "edge", "division", "idf1"),
-    [("epidermis_area1", 0.95, 0.75, 0.86), ("cell_migration", 0.9997, 0.93, 0.994)],
+    [("epidermis_area1", 0.955, 0.75, 0.86), ("cell_migration", 0.9997, 0.93, 0.994)],
 )
 def test_real_recordings_with_shuffled_labels(
     recordings: Path, name: str, edge: float, division: float, idf1: float

@@ -38,16 +38,22 @@ class Divisions:
 
 
 def fit_divisions(
-    movie: Movie, links: Links | None, middle: FloatArray, width: float, tail: float
+    movie: Movie,
+    links: Links | None,
+    middle: FloatArray,
+    *,
+    spread: FloatArray,
+    width: float,
+    tail: float,
 ) -> Divisions:
     """Estimate the daughters' geometry from the divisions found, with a weak general prior.
 
-    `width` and `tail` are those of single cells' steps around `middle` (N, 2), where they are
-    expected.
+    `width`, `tail` and `spread` (N,) are those of single cells' steps around `middle` (N, 2),
+    where they are expected.
     """
     area = movie.shape[:, LOG_AREA]
     centre = float(np.median(area))
-    population = _log_frequency(area)
+    population = log_frequency(area)
     spacing = float(np.median(movie.spacing))
     mothers = np.empty(0, dtype=np.int64)
     if links is not None:
@@ -77,7 +83,7 @@ def fit_divisions(
         informative=informative,
         stretch=_fit_stretch(movie, mothers, one, two),
         population=population,
-        width=_robust_width(np.sum(place**2, axis=1), 1.5 * width, tail),
+        width=_robust_width(np.sum(place**2, axis=1) / spread[mothers] ** 2, 1.5 * width, tail),
     )
 
 
@@ -119,7 +125,7 @@ def _normal(
     return centre, max(float(np.sqrt(variance)), floor)
 
 
-def _log_frequency(values: FloatArray) -> FloatArray:
+def log_frequency(values: FloatArray) -> FloatArray:
     """Log density (N,) of each value among all of them.
 
     Counted, not assumed normal: a merged or broken cell is as rare as there are such cells, and
@@ -131,7 +137,8 @@ def _log_frequency(values: FloatArray) -> FloatArray:
     )
     step = edges[1] - edges[0]
     density = gaussian_filter1d(count / (len(values) * step), _SIZE_BLUR / step, mode="constant")
-    return np.log(np.interp(values, (edges[:-1] + edges[1:]) / 2, density) + _RARE)
+    found = np.interp(values, (edges[:-1] + edges[1:]) / 2, density)
+    return np.asarray(np.log(found + _RARE), dtype=np.float64)
 
 
 def _log_normal(values: FloatArray, mean: float, deviation: float) -> FloatArray:

@@ -132,8 +132,9 @@ def solve(
                 movie,
                 state.links,
                 middle,
-                float(state.motion.scale[0]),
-                float(state.motion.tail[0]),
+                spread=state.motion.spread * np.sqrt(movie.elapsed),
+                width=float(state.motion.scale[0]),
+                tail=float(state.motion.tail[0]),
             )
         state.links = _assign(state, middle, images)
         if progress is not None:
