@@ -301,11 +301,11 @@ def test_extreme_scenes_end_with_an_answer_or_a_refusal(monkeypatch):
 
     for name, found in extreme_scenes.main().items():
         if "error" in found:
-            # From sixteen cells almost on one point every small error grows.
-            limit = 1.0 if "sixteen almost" in name else 0.1
-            assert found["error"] < limit, name
-            assert found.get("adaptive_error", 0.0) < limit, name
-            assert found["reference_error"] < 0.01, name
+            # From these two states every small error grows.
+            steep = name in ("sixteen almost on top", "box of one cell width")
+            assert found["error"] < (1.0 if steep else 0.1), name
+            assert found.get("adaptive_error", 0.0) < (1.0 if steep else 0.02), name
+            assert found["reference_error"] < (0.3 if steep else 1e-3), name
         assert found["outcome"] == "solved" or ";" in found["outcome"], name
         assert 3.5 < found.get("p", 3.6) < 6.0, name
     simulation_report.main()
@@ -374,7 +374,7 @@ def test_a_shape_that_is_none_stops_with_the_partial_run():
     with pytest.raises(SimulationFailure, match=r"a0\^2 <= 0.* even at a step") as caught:
         simulate(DRAWN_OUT, duration=30)
     assert caught.value.run.n_frames > 10
-    assert np.isfinite(caught.value.run.modes).all()
+    assert np.isfinite(caught.value.run.mean_shape_index()).all()
 
 
 def test_scene_files_give_box_radii_and_initial_state():

@@ -20,6 +20,8 @@ from cellquant.sim.scene import Scene, SimulationFailure
 Floats = NDArray[np.float64]
 ContactRule = Literal["exact", "quadrature"]
 NONE = np.empty(0, np.int64)
+NO_SHAPE = "the contour is no longer representable (a0^2 <= 0)"
+DRAWN_OUT = "the cell is drawn out too far: take a larger eta, or a smaller v0 or phi"
 PINCHED = 0.02  # smallest sample of a contour over R0 below which its zeros are sought
 
 
@@ -244,8 +246,7 @@ class Layer:
         reason = "the state is not finite"
         remedy = "take a smaller step or the adaptive integrator"
         if np.isfinite(row[:2]).all() and np.isfinite(row[outlines.HEAD :]).all():
-            reason = "the contour is no longer representable (a0^2 <= 0)"
-            remedy = "the cell is drawn out too far: take a larger eta, or a smaller v0 or phi"
+            reason, remedy = NO_SHAPE, DRAWN_OUT
         raise SimulationFailure(reason, remedy, cell=fault)
 
     def _rebuild(self) -> None:

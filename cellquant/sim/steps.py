@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cellquant.sim.contacts import Layer
+from cellquant.sim.contacts import DRAWN_OUT, NO_SHAPE, Layer
 from cellquant.sim.integrators import Rosenbrock, find_method
 from cellquant.sim.noise import BrownianTree
 from cellquant.sim.scene import SimulationFailure
@@ -129,6 +129,10 @@ class FixedSteps:
             if not moved[:, :2].max() < limit:
                 cell = int(np.argmax(moved[:, :2].max(axis=1)))
                 raise SimulationFailure("a cell moves too far within one step", REMEDY, cell=cell)
+            powers = np.einsum("ij,ij->i", state[:, 3:], state[:, 3:])
+            if not powers.max(initial=0.0) < 2.0:
+                cell = int(np.argmax(powers))
+                raise SimulationFailure(NO_SHAPE, DRAWN_OUT, cell=cell)
             if not (self._explicit or moved[:, 3:].max(initial=0.0) < LARGEST_CHANGE):
                 cell = int(np.argmax(moved[:, 3:].max(axis=1)))
                 raise SimulationFailure("a shape changes too much in one step", REMEDY, cell=cell)
