@@ -250,6 +250,16 @@ def test_a_run_that_promises_too_much_is_refused(name: str, change: dict[str, An
             open_run(path)
 
 
+@pytest.mark.parametrize("name", ["radius", "box", "position", "modes"])
+def test_a_lost_chunk_is_not_read_as_numbers(name: str, tmp_path: Path) -> None:
+    for file, content in run_files().items():
+        if not file.startswith(f"{name}/c/"):
+            (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / file).write_bytes(content)
+    with pytest.raises(InputError, match=f"{name} is incomplete"):
+        open_run(tmp_path).to_tracks(columns=["x", "area", "shape_index"])
+
+
 def test_a_chunk_that_grows_to_gigabytes_is_refused() -> None:
     files = dict(run_files())
     name = next(n for n in files if n.startswith("position/c/"))

@@ -65,7 +65,8 @@ def create_group(path: Path | None, scene: Scene, settings: dict[str, Any]) -> A
 def write_constants(group: Any, radius: Floats, box: Floats) -> None:
     """Store what does not change with time."""
     for name, values in (("radius", radius), ("box", box)):
-        group.create_array(name, shape=values.shape, dtype="float64")[:] = values
+        array = group.create_array(name, shape=values.shape, dtype="float64", fill_value=np.nan)
+        array[:] = values
 
 
 def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> Any:
@@ -244,12 +245,20 @@ class Run:
 
     def _read(self, name: str, where: slice | int) -> Floats:
         try:
-            return np.asarray(self._group[name][where], np.float64)
+            values = np.asarray(self._group[name][where], np.float64)
         except Exception as error:  # whatever a decoder calls it
             raise InputError(
                 f"{self.path or 'the run'}: {name} cannot be decoded ({_first_line(error)}); the "
                 "run is damaged: simulate it again."
             ) from error
+        # A lost file of an array reads as its fill value, NaN; times end where the run does.
+        positive = name in ("radius", "box")
+        if name != "time" and not (np.isfinite(values) & ((values > 0.0) | (not positive))).all():
+            raise InputError(
+                f"{self.path or 'the run'}: {name} is incomplete; a file of it is lost or damaged: "
+                "simulate the run again."
+            )
+        return values
 
     def _frames(self, name: str) -> Floats:
         return self._read(name, slice(self.n_frames))
