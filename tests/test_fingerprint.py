@@ -42,7 +42,7 @@ def test_a_copy_has_the_same_digest(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "sweep", "batch"),
     [
-        ("sim/kernels.py", True, True),
+        ("sim/crossings.py", True, True),
         ("observables/fits.py", True, True),
         ("tables.py", True, True),
         ("__init__.py", True, True),
