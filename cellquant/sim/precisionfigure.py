@@ -70,6 +70,7 @@ def _draw_weak(axis: Any, group: pd.DataFrame, styles: dict[str, int]) -> None:
             linewidth=0.8,
         )  # fmt: skip
     axis.set_xscale("log")
+    axis.xaxis.set_minor_formatter("")
     axis.set_xlabel("CPU time per t0 / s")
 
 
