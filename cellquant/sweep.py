@@ -8,7 +8,6 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from cellquant.config import SceneConfig, SweepConfig, load
@@ -95,25 +94,6 @@ def _simulate_and_observe(task: Task, folder: Path) -> None:
         run = simulate_scene(scene, folder / "run.zarr")
     observe_into(run.to_tracks(), folder, record, options=task["observables"])
     record.write(folder)
-
-
-def _compile(task: Task) -> None:
-    """Compile the kernels of a scene here, so that the workers find them in Numba's cache.
-
-    Processes that compile side by side cost the same minute each and may leave code of several of
-    them in the cache, whose results differ in the last digit.
-    """
-    from cellquant.pipeline import simulate_scene
-
-    chosen = {
-        name: value
-        for name, value in task["scene"].items()
-        if name in ("modes", "contact", "integrator")
-        or (name in ("v0", "eta", "mu_theta") and value == 0)
-    }
-    scene = {**chosen, "phi": 0.8, "cells": 4, "transient": 0, "duration": 0.2, "save_every": 0.2}
-    with TemporaryDirectory() as folder:
-        simulate_scene(SceneConfig.model_validate(scene), Path(folder) / "run.zarr")
 
 
 def run_sweep(
@@ -205,10 +185,6 @@ def sweep_config(
         remove_partial(folder, below=False)
         try:
             with record.stage("runs"):
-                left = (t for t in tasks if finished_key(Path(t["folder"]), "sweep") != t["key"])
-                first = next(left, None)
-                if first is not None and (workers > 1 or scheduler is not None):
-                    _compile(first)
                 outcome = run_tasks(
                     work_on_scene,
                     tasks,

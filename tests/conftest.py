@@ -1,8 +1,6 @@
 """Shared fixtures: where the real recordings are."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,23 +11,6 @@ from hypothesis import settings
 settings.register_profile("quick", derandomize=True)
 settings.register_profile("thorough", max_examples=500, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
-
-COMPILE = """
-import cellquant as cq
-if __name__ == "__main__":
-    cq.observe(cq.simulate(cq.Scene(phi=0.9, n_cells=9), duration=4, seed=1))
-"""
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Compile the kernels in one process before several test processes would do so at once.
-
-    Processes that compile side by side may leave code of several of them in the cache, whose
-    results differ in the last digit.
-    """
-    if not hasattr(config, "workerinput") and getattr(config.option, "numprocesses", None):
-        subprocess.run([sys.executable, "-c", COMPILE], check=True)
-
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -153,7 +153,7 @@ def _scattering_bessel(
                 out[w, k, m] = total
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, fastmath={"contract"}, forceinline=True)
 def _cos_sin(phase: FloatArray, ok: BoolArray, c: FloatArray, s: FloatArray) -> None:
     """Cosine and sine of every phase, 0 where there is none.
 

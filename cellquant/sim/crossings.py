@@ -54,7 +54,7 @@ ROW = np.uint64(CHUNK)
 LINES = 8  # rows of a chunk
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def gap(
     record: Any, i: int, j: int, dx: float, dy: float, cosine: float, sine: float, modes: Any
 ) -> tuple[float, float, float, float, float, float]:
@@ -103,7 +103,7 @@ def gap(
     return depth, change, rho, distance, ux, uy
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     """Rotate a unit vector by a small angle (|angle| < 0.2), to round-off."""
     q = angle * angle
@@ -134,7 +134,7 @@ def variations(g0: float, g1: float, d0: float, d1: float, width: float, margin:
     return 2 if max(b1, b2) > -margin else 0
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def find_windows(near: Any, start: Any, count: Any, filled: int, modes: Any) -> None:
     """Samples of i's contour that can lie within the reach of j, for many pairs.
 
@@ -196,7 +196,7 @@ def find_windows(near: Any, start: Any, count: Any, filled: int, modes: Any) -> 
         count[p] = number[p]
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def sample_pairs(
     grid: Any, pattern: Any, owner: Any, other: Any, near: Any, starts: Any, counts: Any,
     filled: int, modes: Any, gaps: Any, marks: Any, codes: Any,
@@ -316,7 +316,7 @@ def sample_pairs(
     return base
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def start_in_piece(
     low: Any, high: Any, t2: Any, p1: Any, p2: Any, g0: Any, difference: Any, c2: Any, c3: Any
 ) -> Any:
@@ -334,7 +334,7 @@ def start_in_piece(
     return turning + away if low > ZERO else before
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def cubic_step(t: Any, low: Any, high: Any, g0: Any, e0: Any, c2: Any, c3: Any) -> Any:
     """One Newton step on the cubic, from within the piece."""
     t = t if t < high else high
@@ -344,7 +344,7 @@ def cubic_step(t: Any, low: Any, high: Any, g0: Any, e0: Any, c2: Any, c3: Any) 
     return t - value / (rate if abs(rate) > TINY else TINY)
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def full_step(
     t: Any, low: Any, high: Any, g0: Any, e0: Any, c2: Any, c3: Any,
     q0: Any, q1: Any, q2: Any, q3: Any,
@@ -361,7 +361,7 @@ def full_step(
     return t - value / (rate if abs(rate) > TINY else TINY)
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def judge_gaps(gaps: Any, filled: int, modes: Any, kind: Any, guess: Any, curve: Any) -> None:
     """How often the depth crosses zero in every gap, and where.
 
@@ -482,7 +482,7 @@ def judge_gaps(gaps: Any, filled: int, modes: Any, kind: Any, guess: Any, curve:
             curve[row + at] = places[3 * LANES + r]
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def polish(lane: Any, cells: Any, record: Any, result: Any, count: int, modes: Any) -> None:
     """Step of order three on every crossing of a chunk, then its data.
 
@@ -583,7 +583,7 @@ def polish(lane: Any, cells: Any, record: Any, result: Any, count: int, modes: A
                 result[row * CHUNK + begin + column] = out[row * LANES + column]
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def finish(
     lane: Any, result: Any, count: int, cells: Any, record: Any, modes: Any,
     sign: Any, roots: Any, base: int, rest: Any, names: Any, places: Any, second: Any,
@@ -656,7 +656,7 @@ def finish(
             roots[base + r, column] = result[column * CHUNK + r]
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def search_closely(
     record: Any, i: int, j: int, dx: float, dy: float, compass: Any, start: int, count: int,
     modes: Any, stack: Any, found: Any,

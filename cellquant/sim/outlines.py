@@ -76,7 +76,7 @@ def quarter_points(modes: int) -> tuple[Any, Any]:
     return np.ascontiguousarray(np.column_stack(columns)), starts
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def add_points(lane: Any, sums: Any, quarter: Any, begin: int, end: int, modes: Any) -> None:
     """Sum over the points of one level for a tile of cells.
 
@@ -202,7 +202,7 @@ def add_points(lane: Any, sums: Any, quarter: Any, begin: int, end: int, modes: 
         sums[row] = total[row]
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def fill_lanes(
     lane: Any, cells: Any, begin: int, count: int, record: Any, scale: float, modes: Any
 ) -> None:
@@ -220,7 +220,7 @@ def fill_lanes(
                 lane[(1 + m) * LANES + r] = 0.0
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def gradient_of_length(
     cells: Any, count: int, lane: Any, sums: Any, record: Any, quarter: Any, starts: Any,
     modes: Any, tangent: Any,
@@ -260,7 +260,7 @@ def gradient_of_length(
             share *= 0.5
 
 
-@njit(cache=True, fastmath=FLAGS | {"nnan"}, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS | {"nnan"}, error_model="numpy", forceinline=True)
 def sample(
     i: int, record: Any, compass: Any, modes: Any, grid: Any, pattern: Any
 ) -> tuple[float, float]:

@@ -20,7 +20,7 @@ FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 SLOTS = 32  # crossings of a cell whose powers are summed together with those of its tile
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def add_powers(side: Any, used: int, modes: Any, tile: Any) -> None:
     """Add sign exp(i n phi) / i of every crossing to the sums of n = 1 .. 2M; empty the slots.
 
@@ -63,7 +63,7 @@ def add_powers(side: Any, used: int, modes: Any, tile: Any) -> None:
         side[row] = 0.0
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def shape_forces(
     tile: Any, lane: Any, k: float, eta: float, modes: Any, tension: Any, out: Any
 ) -> None:

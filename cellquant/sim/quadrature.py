@@ -12,7 +12,7 @@ from cellquant.sim.outlines import BLOCK, HEAD
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def acos_bound(x: float) -> float:
     """Arc cosine to 7e-5 (Abramowitz & Stegun 4.4.45); pi below -1, 0 above 1."""
     if x >= 1.0:
@@ -24,7 +24,7 @@ def acos_bound(x: float) -> float:
     return root if x >= 0.0 else math.pi - root
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def facing(
     dx: float, dy: float, distance: float, low_i: float, high_i: float, high_j: float,
     spacing: float,

@@ -39,7 +39,7 @@ def row_length(n_modes: int) -> int:
     return LANES * ((2 + LANES + 2 * n_modes) // LANES)
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def normal_displacement(
     radius: Any, record: Any, i: int, c: float, s: float, rho: float, scale: Any, modes: Any,
     weight: Any, row: int, offset: int,
@@ -179,7 +179,7 @@ def push(
     return signature, generate
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def multiply(
     count: int, weight: Any, factor: Any, cells: Any, g: float, modes: Any, direction: Any,
     product: Any,
