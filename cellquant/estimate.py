@@ -14,7 +14,7 @@ PILOT_FRAMES = 32  # states on which the observables are tried
 SHORT = 0.05  # t0 between those
 PILOTS = 3  # scenes tried of each group that differs in phi, v0, eta and the like alone
 # What decides the cost of a step beside the state of the layer.
-_KIND = ("cells", "modes", "contact", "points", "integrator", "dt", "tolerance")
+_KIND = ("cells", "modes", "contact", "points", "integrator", "tolerance")
 # Memory of a worker beside its tables, and of the tables: measured, see docs/scale.md.
 BASE_MEMORY = 345e6
 BYTES_PER_CELL_AND_FRAME = 350.0
@@ -93,7 +93,8 @@ def estimate_sweep(
     scenes = config.scenes()
     for scene in scenes:
         content = scene.model_dump()
-        groups.setdefault(content_key({k: content[k] for k in _KIND}), []).append(scene)
+        kind = {name: content[name] for name in _KIND} | {"step": _step(scene)}
+        groups.setdefault(content_key(kind), []).append(scene)
         different.add(content_key({k: v for k, v in content.items() if k != "seed"}))
     chosen = {key: _spread(members, PILOTS) for key, members in groups.items()}
     total = sum(len(pilots) for pilots in chosen.values())
@@ -131,6 +132,15 @@ def estimate_sweep(
 
 def _frames(scene: SceneConfig) -> float:
     return scene.duration / (scene.save_every or max(1.0, scene.duration / 2000)) + 1
+
+
+def _step(scene: SceneConfig) -> float:
+    from cellquant.sim import Scene
+    from cellquant.sim.integrators import METHODS, recommended
+
+    reduced = Scene.from_config(scene)
+    name = scene.integrator or recommended(reduced, scene.contact)
+    return scene.dt or METHODS[name].usual_step(reduced)
 
 
 def _spread(members: list[SceneConfig], number: int) -> list[SceneConfig]:

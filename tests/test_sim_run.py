@@ -40,6 +40,12 @@ def test_frames_have_the_layout_of_the_contract(tmp_path):
     assert run.work["evaluations"] > 0
 
 
+def test_the_usual_step_is_shorter_for_fast_cells():
+    for v0, usual in ((0.0, 0.1), (0.03, 0.1), (0.06, 0.05), (0.3, 0.01)):
+        run = simulate(Scene(n_cells=4, phi=0.6, v0=v0), duration=0.2, save_every=0.2)
+        assert run.settings["dt"] == pytest.approx(usual)
+
+
 def test_interrupted_run_resumes_bitwise(tmp_path, monkeypatch):
     whole = simulate(SMALL, duration=6, transient=1, dt=0.02, output=tmp_path / "whole.zarr")
     monkeypatch.setattr(run_module, "CHECKPOINT_EVERY", 0.0)

@@ -93,10 +93,15 @@ class _Clock:
         return time.monotonic() - self.started
 
     @property
+    def speed(self) -> float | None:
+        """Units of work per second so far; None before anything is done."""
+        worked = self.done - (self.first or 0)
+        return worked / self.elapsed if worked > 0 and self.elapsed > 0.0 else None
+
+    @property
     def left(self) -> float | None:
         """Seconds left at the speed so far; None before anything is done."""
-        worked = self.done - (self.first or 0)
-        return self.elapsed / worked * (self.total - self.done) if worked > 0 else None
+        return None if self.speed is None else (self.total - self.done) / self.speed
 
 
 @contextlib.contextmanager
@@ -109,7 +114,7 @@ def step(label: str, unit: str = "frames") -> Iterator[ProgressCallback]:
         _emit("end", step=label, unit=unit, done=clock.done, total=clock.total, **_times(clock))
         return
     if _chosen is Progress.auto and sys.stderr.isatty():
-        with _bar(label, clock) as move:
+        with _bar(label, unit, clock) as move:
             yield move
     else:
         yield _in_lines(label, unit, clock)
@@ -118,7 +123,7 @@ def step(label: str, unit: str = "frames") -> Iterator[ProgressCallback]:
 
 
 @contextlib.contextmanager
-def _bar(label: str, clock: _Clock) -> Iterator[ProgressCallback]:
+def _bar(label: str, unit: str, clock: _Clock) -> Iterator[ProgressCallback]:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -133,15 +138,16 @@ def _bar(label: str, clock: _Clock) -> Iterator[ProgressCallback]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        TextColumn("{task.fields[speed]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(label, total=None)
+        task = bar.add_task(label, total=None, speed="")
 
         def move(done: int, total: int) -> None:
             clock.move(done, total)
-            bar.update(task, completed=done, total=total)
+            bar.update(task, completed=done, total=total, speed=_speed(clock, unit))
 
         yield move
 
@@ -154,7 +160,9 @@ def _in_lines(label: str, unit: str, clock: _Clock) -> ProgressCallback:
         clock.move(done, total)
         if time.monotonic() - last >= LINE_EVERY and done < total:
             last = time.monotonic()
-            left = "" if clock.left is None else f", about {_duration(clock.left)} left"
+            left = (
+                f", {_speed(clock, unit)}, about {_duration(clock.left)} left" if clock.left else ""
+            )
             note(f"{label}: {done} of {total} {unit} after {_duration(clock.elapsed)}{left}")
 
     return move
@@ -174,11 +182,17 @@ def _in_json(label: str, unit: str, clock: _Clock) -> ProgressCallback:
 
 
 def _times(clock: _Clock) -> dict[str, float | None]:
-    left = clock.left
+    left, speed = clock.left, clock.speed
     return {
         "elapsed_s": round(clock.elapsed, 3),
         "left_s": None if left is None else round(left, 3),
+        "per_s": None if speed is None else float(f"{speed:.4g}"),
     }
+
+
+def _speed(clock: _Clock, unit: str) -> str:
+    """Speed so far in words, e.g. ``12 t0/s``."""
+    return "" if clock.speed is None else f"{clock.speed:.3g} {unit}/s"
 
 
 def _duration(seconds: float) -> str:

@@ -70,7 +70,8 @@ def simulate(
     integrator
         Name of the method; None for the recommended one.
     dt
-        Longest step, t0; None for the usual one of the method. Steps divide `save_every`.
+        Longest step, t0; None for the usual one of the method, shorter where cells are fast
+        (`Method.usual_step`). Steps divide `save_every`.
     tolerance
         RMS error of the centres that a step of the adaptive method may make, L0; chooses it.
     save_every
@@ -112,7 +113,7 @@ def simulate(
     if (dt if method.adaptive else tolerance) is not None:
         kind = "a tolerance and no dt" if method.adaptive else "dt and no tolerance"
         raise InputError(f"the integrator {name} takes {kind}; change the options.")
-    longest = frame_interval if method.adaptive else (dt or method.dt)
+    longest = frame_interval if method.adaptive else (dt or method.usual_step(scene))
     plan = Plan.of(duration, transient, frame_interval, longest)
     settings = {
         "contact": contact,

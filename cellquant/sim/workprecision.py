@@ -203,7 +203,7 @@ def _settled(scene: Scene, transient: float) -> Start:
     layer = Layer(scene, radius, box)
     name = recommended(scene, "exact")
     tree = BrownianTree(scene.seed, scene.n_cells, 0.4)
-    depth = math.ceil(math.log2(0.4 / METHODS[name].dt))
+    depth = math.ceil(math.log2(0.4 / METHODS[name].usual_step(scene)))
     method = METHODS[name].make(layer)
     for root in range(math.ceil(transient / 0.4)):
         w, area = tree.level(root, depth)
