@@ -1,8 +1,11 @@
 """The program as users run it: exit codes, one-sentence errors, nothing half-written."""
 
+import contextlib
 import inspect
+import io
 import json
 import pickle
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +17,7 @@ import pandas as pd
 import pytest
 import tifffile
 
+from cellquant.cli import main
 from cellquant.cli.movies import observe
 from cellquant.config import ObservablesConfig
 from cellquant.observables.settings import Settings
@@ -23,9 +27,30 @@ CALIBRATED = ("--pixel-size", "0.65", "--frame-interval", "10")
 HEAVY = ("numba", "statsmodels", "matplotlib", "trackpy", "pandas", "numpy", "scipy", "cv2")
 
 
-def cellquant(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+def program(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """The program as a process of its own."""
     command = [sys.executable, "-m", "cellquant", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+
+
+def cellquant(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """The same in this process, which has loaded everything already."""
+    written, told, code = io.StringIO(), io.StringIO(), 0
+    handler = signal.getsignal(signal.SIGTERM)
+    command = ["cellquant", *map(str, arguments)]
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(written),
+        contextlib.redirect_stderr(told),
+    ):
+        patch.setattr(sys, "argv", command)
+        try:
+            main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        finally:
+            signal.signal(signal.SIGTERM, handler)
+    return subprocess.CompletedProcess(command, code, written.getvalue(), told.getvalue())
 
 
 @pytest.fixture
@@ -55,8 +80,8 @@ def test_help_loads_nothing_heavy() -> None:
 def test_version_and_unknown_option() -> None:
     from cellquant import __version__
 
-    assert cellquant("--version").stdout.strip() == f"cellquant {__version__}"
-    wrong = cellquant("track", "--no-such-option")
+    assert program("--version").stdout.strip() == f"cellquant {__version__}"
+    wrong = program("track", "--no-such-option")
     assert wrong.returncode == 2
     assert "Traceback" not in wrong.stderr
 
@@ -73,7 +98,7 @@ def test_inspect_prints_what_is_there(movie: Path) -> None:
 
 def test_track_observe_export(movie: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    tracked = cellquant("track", movie, "-o", out, *CALIBRATED, "--export", "ctc")
+    tracked = program("track", movie, "-o", out, *CALIBRATED, "--export", "ctc")
     assert tracked.returncode == 0, tracked.stderr
     tracks = pd.read_parquet(out / "tracks.parquet")
     assert tracks["track_id"].nunique() == 16
@@ -85,7 +110,7 @@ def test_track_observe_export(movie: Path, tmp_path: Path) -> None:
     assert manifest["settings"]["pixel_size"] == 0.65
     assert str(movie) in manifest["inputs"]
 
-    observed = cellquant("observe", out, "-o", tmp_path / "obs")
+    observed = program("observe", out, "-o", tmp_path / "obs")
     assert observed.returncode == 0, observed.stderr
     summary = json.loads((tmp_path / "obs" / "summary.json").read_text())
     assert summary["length_unit"] == "um"
@@ -94,7 +119,7 @@ def test_track_observe_export(movie: Path, tmp_path: Path) -> None:
     # Discs of 7 px radius: the circle's shape index is 2 sqrt(pi).
     assert summary["shape_index"]["mean"] == pytest.approx(2 * np.sqrt(np.pi), rel=0.015)
 
-    exported = cellquant("export", out, "--to", "csv", "-o", tmp_path / "tracks.csv")
+    exported = program("export", out, "--to", "csv", "-o", tmp_path / "tracks.csv")
     assert exported.returncode == 0, exported.stderr
     assert (tmp_path / "tracks.csv").is_file()
 
