@@ -2,9 +2,9 @@
 
     python benchmarks/fault_campaign.py [--kills 220] [--errors 40] [--commands 24] [--job run]
 
-Each fault strikes a job in an empty folder; the job is then given again, without a fault, and
-every table, summary, stack report and simulated array must equal those of a job that was never
-disturbed. Faults:
+Each fault strikes a job in an empty folder. Whatever stands there then under its final name must
+be readable; the job is given again, without a fault, and every table, summary, stack report and
+simulated array must equal those of a job that was never disturbed. Faults:
 
 - kill at a file operation: SIGKILL just before the n-th open, rename, link, mkdir or removal
 - kill at a time: SIGKILL after a time drawn from the length of the job
@@ -12,8 +12,9 @@ disturbed. Faults:
 - command: a real `cellquant` process with two workers loses a worker, its parent, or all of them
 
 The first three fork a process in which everything is loaded and compiled, so that a fault costs a
-second or two. Writes benchmarks/results/fault_campaign_*.json after every fault, goes on from there
-when it is given again, and writes the table of docs/reliability.md.
+second or two. Writes fault_campaign_*.json into --results (benchmarks/results) after every fault
+and goes on from there when it is given again with the same code; with --page it writes the table
+of docs/reliability.md.
 """
 
 import argparse
@@ -185,6 +186,28 @@ def check(job: Job, out: Path) -> str:
     return f"{len(differing)} files differ, first {differing[0]}" if differing else ""
 
 
+def unreadable(out: Path) -> str:
+    """Name of a file that stands under its final name and cannot be read; empty where none is."""
+    import pyarrow.parquet as pq
+
+    from cellquant.sim import open_run
+
+    for path in sorted(out.rglob("*")):
+        if any(part.endswith(".partial") for part in path.relative_to(out).parts):
+            continue
+        try:
+            if path.suffix == ".json":
+                json.loads(path.read_text("utf-8"))
+            elif path.suffix == ".parquet":
+                pq.read_metadata(path)
+            elif path.suffix == ".zarr":
+                run = open_run(path)
+                assert len(run.position) == run.n_frames
+        except Exception as error:  # whatever it is, it is what the campaign looks for
+            return f"{path.name} cannot be read ({error})"
+    return ""
+
+
 def kill_at_event(job: Job, out: Path, rng: random.Random) -> str:
     last = rng.randint(1, job.events)
 
@@ -277,9 +300,16 @@ def campaign(job: Job, counts: dict[str, int], seed: int, place: Path, results: 
 
     The results are written after every fault, one row each.
     """
+    rows = read_rows(results)
+    wanted = {
+        f"{job.name}, {kind}, seed {seed}, number {number}"
+        for kind, count in counts.items()
+        for number in range(count)
+    }
+    if wanted <= {row["name"] for row in rows}:
+        return
     place.mkdir()
     measure(job, place)
-    rows = read_rows(results)
     for number in range(max(counts.values())):  # all kinds in turn, so that a part is a sample
         for kind, count in counts.items():
             name = f"{job.name}, {kind}, seed {seed}, number {number}"
@@ -288,10 +318,9 @@ def campaign(job: Job, counts: dict[str, int], seed: int, place: Path, results: 
             out = place / "out"
             shutil.rmtree(out, ignore_errors=True)
             where = FAULTS[kind](job, out, random.Random(name))
-            problem = check(job, out)
-            if "EXIT CODE" in where:
-                problem = f"{where}; {problem}"
-            row = {"name": name, "job": job.name, "fault": kind, "where": where}
+            problems = [where if "EXIT CODE" in where else "", unreadable(out), check(job, out)]
+            problem = "; ".join(text for text in problems if text)
+            row = {"name": name, "job": job.name, "fault": kind, "where": where, "code": code()}
             rows.append({**row, "problem": problem})
             results.write_text(json.dumps(rows, indent=1) + "\n")
             if problem:
@@ -299,12 +328,17 @@ def campaign(job: Job, counts: dict[str, int], seed: int, place: Path, results: 
         print(f"{job.name}: {len(rows)} faults", flush=True)
 
 
-def results_of(job: str) -> Path:
-    return HERE / "results" / f"fault_campaign_{job}.json"
+def code() -> str:
+    """What decides whether a fault must be tried again."""
+    from cellquant.fingerprint import code_digest
+
+    return code_digest("batch")[:16] + code_digest("sweep")[:16]
 
 
 def read_rows(results: Path) -> list[dict[str, Any]]:
-    return list(json.loads(results.read_text())) if results.is_file() else []
+    """Rows of an earlier call with the same code."""
+    rows = json.loads(results.read_text()) if results.is_file() else []
+    return [row for row in rows if row["code"] == code()]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -328,6 +362,8 @@ def main() -> None:
     parser.add_argument("--commands", type=int, default=24)
     parser.add_argument("--job", choices=("run", "sweep"), help="both when absent")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--results", type=Path, default=HERE / "results")
+    parser.add_argument("--page", action="store_true", help="write the table of the page")
     arguments = parser.parse_args()
     counts = {
         "kill at a file operation": arguments.kills // 4,
@@ -335,18 +371,21 @@ def main() -> None:
         "full disk": arguments.errors // 2,
         "command with two workers": arguments.commands // 2,
     }
+    files = {job: arguments.results / f"fault_campaign_{job}.json" for job in ("run", "sweep")}
     memory = "/dev/shm" if Path("/dev/shm").is_dir() else None  # a kill needs no real disk
     with tempfile.TemporaryDirectory(dir=memory) as name:
         for job in jobs(Path(name)):
             if arguments.job in (None, job.name):
                 place = Path(name) / job.name
-                campaign(job, counts, arguments.seed, place, results_of(job.name))
-    rows = [row for job in ("run", "sweep") for row in read_rows(results_of(job))]
-    page = PAGE.read_text(encoding="utf-8")
-    before, rest = page.split(BEGIN)
-    after = rest.split(END)[1]
-    PAGE.write_text(f"{before}{BEGIN}\n{table(rows)}\n{END}{after}", encoding="utf-8")
-    print(table(rows))
+                campaign(job, counts, arguments.seed, place, files[job.name])
+    rows = [row for file in files.values() for row in read_rows(file)]
+    text = table(rows)
+    if arguments.page:
+        page = PAGE.read_text(encoding="utf-8")
+        before, rest = page.split(BEGIN)
+        after = rest.split(END)[1]
+        PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+    print(text)
     if any(row["problem"] for row in rows):
         sys.exit("some faults did not end in the same bytes")
 

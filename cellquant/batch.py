@@ -23,6 +23,7 @@ from cellquant.storage import (
     RunRecord,
     begin,
     check_output,
+    clear_disk_errors,
     content_key,
     digest,
     earlier_record,
@@ -220,6 +221,7 @@ def run_experiment(
     )
 
 
+@clear_disk_errors()
 def run_config(
     config: ExperimentConfig,
     base: Path,

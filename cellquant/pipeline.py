@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cellquant.errors import InputError
-from cellquant.storage import RunRecord, atomic_path, check_output
+from cellquant.storage import RunRecord, check_output, replace_together
 
 if TYPE_CHECKING:
     from cellquant.config import SceneConfig
@@ -101,16 +101,15 @@ def track_movie(
         "tracks": tracks.n_tracks,
         "faults": dict(cells.faults),
     }
-    with record.stage("write"):
-        with atomic_path(folder / "cells.parquet") as path:
-            cells.write(path)
-        with atomic_path(folder / "tracks.parquet") as path:
-            tracks.write(path)
-        if export_ctc:
-            from cellquant.io import write_ctc
+    with replace_together(folder) as place:
+        with record.stage("write"):
+            cells.write(place / "cells.parquet")
+            tracks.write(place / "tracks.parquet")
+            if export_ctc:
+                from cellquant.io import write_ctc
 
-            write_ctc(folder / "ctc", masks, tracks.table)
-    record.write(folder)
+                write_ctc(place / "ctc", masks, tracks.table)
+        record.write(place, after=folder)
     return cells, tracks, record
 
 
@@ -258,10 +257,11 @@ def observe_source(
             step=step,
         )
         record.add_input(_file_of(Path(source), data))
-    observables = observe_into(
-        data, folder, record, options={"only": only, **(options or {})}, step=step
-    )
-    record.write(folder)
+    observables = _observe(data, record, {"only": only, **(options or {})}, step)
+    with replace_together(folder) as place:
+        with record.stage("write observables"):
+            observables.write(place)
+        record.write(place, after=folder)
     return observables, record
 
 
@@ -274,13 +274,17 @@ def observe_into(
     step: Step = silent,
 ) -> "Observables":
     """Observe tracks or cells and write the tables; the record is left for the caller to write."""
-    from cellquant.observables import observe
-
-    with record.stage("observe"), step("observe"):
-        observables = observe(data, **(options or {}))
+    observables = _observe(data, record, options or {}, step)
     with record.stage("write observables"):
         observables.write(folder)
     return observables
+
+
+def _observe(data: Any, record: RunRecord, options: Mapping[str, Any], step: Step) -> "Observables":
+    from cellquant.observables import observe
+
+    with record.stage("observe"), step("observe"):
+        return observe(data, **options)
 
 
 def _file_of(source: Path, data: Any) -> Path:

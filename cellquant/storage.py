@@ -33,11 +33,12 @@ _LIBRARIES = (
 )
 FINISHED = "finished.json"  # folders of the results that belong to a study or a sweep
 STARTED = ".started"  # key of the work that a folder holds, finished or not
+_CLOSED = {errno.EACCES, errno.EPERM}
 _DISK_ERRORS = {
-    getattr(errno, name)
-    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM")
-    if hasattr(errno, name)
-}
+    *_CLOSED,
+    *(getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EIO")
+      if hasattr(errno, name)),
+}  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -63,29 +64,76 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         If the folder cannot be made or written, or the disk is full.
     """
     path = Path(path)
+    with _holder(path.parent, path) as holder, _clear_errors(path, holder):
+        temporary = holder / path.name
+        yield temporary
+        _flush(temporary)
+        _replace(temporary, path, holder)
+
+
+@contextlib.contextmanager
+def replace_together(folder: str | Path) -> Iterator[Path]:
+    """Give an empty folder to write to, and move what it holds into `folder` when the block ends.
+
+    For results that belong together: when one of them cannot be written, all the old ones stay.
+    The manifest comes last, and an old one goes first, so that a folder with a manifest never
+    holds a mixture.
+
+    Parameters
+    ----------
+    folder
+        The output folder; made when it does not exist.
+
+    Yields
+    ------
+    pathlib.Path
+        A folder on the same file system.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written, or the disk is full.
+    """
+    folder = Path(folder)
+    with _holder(folder, folder) as holder, _clear_errors(folder, holder):
+        staged = holder / "staged"
+        staged.mkdir()
+        yield staged
+        _flush(staged)
+        if (staged / MANIFEST).is_file():
+            (folder / MANIFEST).unlink(missing_ok=True)
+        for entry in sorted(staged.iterdir(), key=lambda entry: (entry.name == MANIFEST, entry)):
+            _replace(entry, folder / entry.name, holder)
+
+
+@contextlib.contextmanager
+def _holder(folder: Path, target: Path) -> Iterator[Path]:
+    """A temporary folder inside `folder`, which is made where it is missing."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        holder = Path(tempfile.mkdtemp(".partial", f".{path.name[:100]}.", path.parent))
+        folder.mkdir(parents=True, exist_ok=True)
+        holder = Path(tempfile.mkdtemp(".partial", f".{target.name[:100]}.", folder))
     except OSError as error:
         raise InputError(
-            f"cannot write {path}: {error.strerror}; choose an output path in a folder that "
+            f"cannot write {target}: {error.strerror}; choose an output path in a folder that "
             "exists or can be made, and that you may write to."
         ) from error
-    temporary = holder / path.name
     try:
-        try:
-            yield temporary
-            _flush(temporary)
-            _replace(temporary, path, holder)
-        except OSError as error:
-            if error.filename is not None and not _inside(Path(str(error.filename)), holder):
-                raise
-            raise InputError(
-                f"cannot write {path}: {error.strerror or error}; free space or choose another "
-                "output path."
-            ) from error
+        yield holder
     finally:
         shutil.rmtree(holder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _clear_errors(target: Path, holder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and not _inside(Path(str(error.filename)), holder):
+            raise
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise InputError(
+            f"cannot write {target}: {reason}; free space or choose another output path."
+        ) from error
 
 
 def check_output(path: str | Path) -> Path:
@@ -140,7 +188,7 @@ def _fsync(path: Path) -> None:
 def _replace(temporary: Path, path: Path, holder: Path) -> None:
     # rename() cannot replace a folder that is not empty: the old one steps aside first.
     if path.is_dir() and not path.is_symlink():
-        path.rename(holder / "replaced")
+        path.rename(holder / f"replaced {path.name}")
     temporary.replace(path)
     _fsync(path.parent)
 
@@ -249,14 +297,38 @@ def remove_partial(folder: Path, *, below: bool = True) -> None:
             entry.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def clear_disk_errors() -> Iterator[None]:
+    """Say in one sentence that a disk is full, read-only or closed to us.
+
+    Raises
+    ------
+    InputError
+        Instead of the `OSError` of such a disk; other errors pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        problem = disk_problem(error)
+        if problem is None:
+            raise
+        raise InputError(problem) from error
+
+
 def disk_problem(error: BaseException) -> str | None:
     """One sentence for a disk that is full, read-only or closed to us; None for other errors."""
     if not isinstance(error, OSError) or error.errno is None or error.errno not in _DISK_ERRORS:
         return None
+    reason = os.strerror(error.errno)
+    if error.errno in _CLOSED and error.filename:
+        return (
+            f"{error.filename} is closed to you ({reason}); change its permissions or choose "
+            "another path, then run the same command again."
+        )
     what = f"cannot write {error.filename}" if error.filename else "cannot write the results"
     return (
-        f"{what}: {os.strerror(error.errno)}; free space or choose an output folder that you may "
-        "write to, then run the same command again."
+        f"{what}: {reason}; free space or choose an output folder that you may write to, then run "
+        "the same command again."
     )
 
 
@@ -323,14 +395,17 @@ class RunRecord:
             "machine": machine(),
         }
 
-    def write(self, folder: str | Path) -> None:
-        """Write ``run.json`` into `folder`; call it last, when every other file is there."""
+    def write(self, folder: str | Path, *, after: str | Path | None = None) -> None:
+        """Write ``run.json`` into `folder`; call it last, when every other file is there.
+
+        The records of other commands in `after` are kept; that is `folder` itself when None.
+        """
         content = self.as_dict()
-        path = Path(folder) / MANIFEST
-        earlier = [r for r in _earlier(path) if r.get("command") != self.command]
+        earlier = _earlier(Path(folder if after is None else after) / MANIFEST)
+        earlier = [r for r in earlier if r.get("command") != self.command]
         if earlier:
             content["earlier"] = earlier
-        write_json(path, content)
+        write_json(Path(folder) / MANIFEST, content)
 
 
 def _earlier(path: Path) -> list[dict[str, Any]]:

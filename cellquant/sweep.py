@@ -20,6 +20,7 @@ from cellquant.storage import (
     atomic_path,
     begin,
     check_output,
+    clear_disk_errors,
     content_key,
     finished_key,
     make_folder,
@@ -141,6 +142,7 @@ def run_sweep(
     )
 
 
+@clear_disk_errors()
 def sweep_config(
     config: SweepConfig,
     out: str | Path,

@@ -198,8 +198,14 @@ def test_the_command_reports_failures_by_its_exit_code(study: Path, tmp_path: Pa
     write_stack(tmp_path / "b" / "three.tif", seed=3)
     (tmp_path / "a" / "two.tif").write_bytes(b"")
     command = [sys.executable, "-m", "cellquant", "run", str(study), "-o", str(tmp_path / "out")]
+    command += ["--progress", "json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)
     assert done.returncode == 2
     assert "stacks: 2 done, 0 finished before, 1 failed" in done.stdout
     assert "failed: untreated/day 1/two" in done.stdout
-    assert "Traceback" not in done.stderr
+    events = [json.loads(line) for line in done.stderr.splitlines()]
+    assert [event["event"] for event in events[:2]] == ["start", "progress"]
+    moves = [event for event in events if event["event"] == "progress"]
+    assert moves[-1].items() >= {"step": "stacks", "unit": "stacks", "done": 3, "total": 3}.items()
+    assert moves[-1]["elapsed_s"] > 0
+    assert moves[-1]["left_s"] == 0

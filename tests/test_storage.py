@@ -10,7 +10,6 @@ import textwrap
 from pathlib import Path
 
 import pytest
-import tifffile
 
 from cellquant.errors import InputError
 from cellquant.storage import (
@@ -22,7 +21,6 @@ from cellquant.storage import (
     disk_problem,
     write_json,
 )
-from examples import drifting_discs
 
 
 def test_a_failing_block_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -137,21 +135,15 @@ def test_only_errors_of_the_disk_are_the_users(tmp_path: Path) -> None:
     assert disk_problem(RuntimeError("ours")) is None
 
 
-@pytest.mark.parametrize("command", ["track", "sweep"])
-def test_a_disk_that_fills_up_is_one_sentence(tmp_path: Path, command: str) -> None:
+def test_a_disk_that_fills_up_is_one_sentence(tmp_path: Path) -> None:
     """No file may grow beyond 3 kB: the writers meet EFBIG in the middle of their work."""
-    movie, sweep = tmp_path / "m.tif", tmp_path / "s.toml"
-    tifffile.imwrite(movie, drifting_discs(5))
+    sweep = tmp_path / "s.toml"
     sweep.write_text("[scene]\ncells = 9\ntransient = 0\nduration = 3\n")
-    arguments = {
-        "track": [str(movie), "--pixel-size", "0.5", "--frame-interval", "10"],
-        "sweep": [str(sweep)],
-    }[command]
     code = f"""
         import resource, sys
         from cellquant.cli import main
         resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
-        sys.argv = ["cellquant", {command!r}, *{arguments!r}, "-o", {str(tmp_path / "out")!r}]
+        sys.argv = ["cellquant", "sweep", {str(sweep)!r}, "-o", {str(tmp_path / "out")!r}]
         main()
     """
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "0"}
@@ -166,3 +158,25 @@ def test_a_disk_that_fills_up_is_one_sentence(tmp_path: Path, command: str) -> N
     assert "Traceback" not in done.stderr
     assert "File too large" in done.stderr + done.stdout
     assert not list((tmp_path / "out").rglob("*.partial"))
+
+
+@pytest.mark.parametrize(
+    "swallow", ["raise ImportError('half loaded')", "time.sleep(60)"], ids=["another error", "none"]
+)
+def test_an_interruption_ends_the_program_whatever_becomes_of_it(swallow: str) -> None:
+    code = f"""
+        import os, signal, time
+        from cellquant import cli
+        def work():
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(60)
+            except KeyboardInterrupt:
+                {swallow}
+        cli.app, cli.GRACE = work, 0.2
+        cli.main()
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "")

@@ -3,8 +3,10 @@
 Heavy modules are imported inside the commands, so that ``cellquant --help`` starts at once.
 """
 
+import os
 import signal
 import sys
+import threading
 from types import FrameType
 
 import typer
@@ -44,21 +46,44 @@ for module in (movies, layers, batch, reports):
     module.register(app)
 
 
+GRACE = 5  # seconds to end in order after an interruption
+
+
+class _Interruption:
+    """Whether the program was asked to stop."""
+
+    asked = False
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    _Interruption.asked = True
+    # What was under way may swallow the exception: a compiler does, or a finaliser.
+    last = threading.Timer(GRACE, os._exit, (130,))
+    last.daemon = True
+    last.start()
     raise KeyboardInterrupt
 
 
 def main() -> None:
     """Run the program; exit codes: 0 done, 2 wrong input, 1 a fault of ours, 130 interrupted."""
     # A batch system ends a job with SIGTERM: that is an interruption like any other.
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
+    try:
+        _run()
+    except BaseException:
+        # An interruption may arrive as another error, from a library that was being loaded.
+        if _Interruption.asked:
+            sys.exit(130)
+        raise
+
+
+def _run() -> None:
     try:
         app()
     except InputError as error:
         complain(str(error))
         sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
     except OSError as error:
         from cellquant.storage import disk_problem
 

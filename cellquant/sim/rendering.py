@@ -1,7 +1,6 @@
 """A run as a movie: label masks, true tracks and contours, and a picture like phase contrast."""
 
 import math
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from cellquant.errors import InputError
 from cellquant.io import LabelStack, read_labels, write_ctc, write_labels
 from cellquant.sim.archive import Run
 from cellquant.sim.shapes import contours, measure_shapes
+from cellquant.storage import atomic_path
 from cellquant.tables import PHYSICAL, TRACK_COLUMNS, Tracks
 
 Floats = NDArray[np.float64]
@@ -198,18 +198,13 @@ def render(
         if progress is not None:
             progress(number + 1, len(frames))
     interval = float(run.settings["save_every"]) * step * time
-    output.parent.mkdir(parents=True, exist_ok=True)
     write_labels(output, masks, pixel_size=pixel_size, frame_interval=interval)
     tracks, order = _true_tracks(tables, run, length, interval, (height, width), pixel_size)
-    partial = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
     stack: LabelStack = read_labels(output)
-    write_ctc(partial / "TRA", stack, tracks.table)
-    tracks.write(partial / "tracks.parquet")
-    np.save(partial / "contours.npy", np.concatenate(outlines)[order] * np.float32(length))
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
+    with atomic_path(folder) as partial:
+        write_ctc(partial / "TRA", stack, tracks.table)
+        tracks.write(partial / "tracks.parquet")
+        np.save(partial / "contours.npy", np.concatenate(outlines)[order] * np.float32(length))
     picture = None
     if phase_contrast is not None:
         picture = Path(phase_contrast)
@@ -365,22 +360,22 @@ def _write_picture(
     def pages() -> Iterator[NDArray[np.uint8]]:
         yield from frames
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tifffile.imwrite(
-        path,
-        pages(),
-        shape=(len(frames), *frames[0].shape),
-        dtype=np.uint8,
-        compression="zlib",
-        ome=True,
-        metadata={
-            "axes": "TYX",
-            "PhysicalSizeX": pixel_size,
-            "PhysicalSizeXUnit": "µm",
-            "PhysicalSizeY": pixel_size,
-            "PhysicalSizeYUnit": "µm",
-            "TimeIncrement": interval * 60.0,
-            "TimeIncrementUnit": "s",
-            "UUID": "urn:uuid:00000000-0000-0000-0000-000000000000",
-        },
-    )
+    with atomic_path(path) as temporary:
+        tifffile.imwrite(
+            temporary,
+            pages(),
+            shape=(len(frames), *frames[0].shape),
+            dtype=np.uint8,
+            compression="zlib",
+            ome=True,
+            metadata={
+                "axes": "TYX",
+                "PhysicalSizeX": pixel_size,
+                "PhysicalSizeXUnit": "µm",
+                "PhysicalSizeY": pixel_size,
+                "PhysicalSizeYUnit": "µm",
+                "TimeIncrement": interval * 60.0,
+                "TimeIncrementUnit": "s",
+                "UUID": "urn:uuid:00000000-0000-0000-0000-000000000000",
+            },
+        )

@@ -27,7 +27,7 @@ from cellquant.sim.integrators import find_method, recommended
 from cellquant.sim.scene import Scene, SimulationFailure
 from cellquant.sim.shapes import pinched
 from cellquant.sim.steps import AdaptiveSteps, FixedSteps, Plan
-from cellquant.storage import atomic_path
+from cellquant.storage import atomic_path, clear_disk_errors
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -38,6 +38,7 @@ TOLERANCE = 1e-3  # of the adaptive method, L0
 FRAMES_IN_MEMORY = 2_000_000  # numbers of buffered frames before they are written
 
 
+@clear_disk_errors()
 def simulate(
     scene: Scene,
     *,

@@ -22,6 +22,7 @@ from cellquant.sim.scene import Scene, SimulationFailure
 from cellquant.sim.shapes import measure_shapes
 from cellquant.sim.steps import AdaptiveSteps, Plan
 from cellquant.sim.weakerrors import Start, weak_errors
+from cellquant.storage import replace_together
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -292,10 +293,6 @@ def _shape_index(state: Floats, radius: Floats) -> Floats:
 def _write(result: Convergence, folder: Path, scene: Scene, duration: float) -> None:
     from cellquant.sim.precisionfigure import draw
 
-    folder.mkdir(parents=True, exist_ok=True)
-    result.table.to_parquet(folder / "convergence.parquet", index=False)
-    if len(result.weak):
-        result.weak.to_parquet(folder / "weak_errors.parquet", index=False)
     content = {
         "scene": scene.to_dict(),
         "duration": duration,
@@ -303,6 +300,10 @@ def _write(result: Convergence, folder: Path, scene: Scene, duration: float) -> 
         "reference_error": result.reference_error,
         "recommendation": result.recommendation,
     }
-    text = json.dumps(content, indent=1, sort_keys=True)
-    (folder / "convergence.json").write_text(text + "\n", encoding="utf-8")
-    draw(result.table, result.weak, result.sampling_error, folder / "convergence.svg")
+    with replace_together(folder) as place:
+        result.table.to_parquet(place / "convergence.parquet", index=False)
+        if len(result.weak):
+            result.weak.to_parquet(place / "weak_errors.parquet", index=False)
+        text = json.dumps(content, indent=1, sort_keys=True)
+        (place / "convergence.json").write_text(text + "\n", encoding="utf-8")
+        draw(result.table, result.weak, result.sampling_error, place / "convergence.svg")
