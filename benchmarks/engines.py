@@ -3,10 +3,14 @@
     python benchmarks/engines.py [--repeats 3] [--scenes 20]
 
 A sweep of small scenes with one worker, with two, and on a Dask cluster of two local worker
-processes, in turn, repeated; the throughput counts from the first to the last finished run, since
+processes, in turn, repeated; the throughput counts from the second to the last finished run, since
 starting processes costs the same few seconds however long the sweep is. The overhead is that of
-tasks that do nothing. Ratios are medians over the repetitions, with their range; the load of the
-machine stands beside them. Writes benchmarks/results/engines.json.
+tasks that do nothing. Ratios are medians over the repetitions, with their range.
+
+On a machine that others use, a worker waits for a core that it would have alone. The system counts
+that time (``/proc/PID/schedstat``), so each ratio stands there twice: as the clock gives it, and
+with the time left out in which a worker was ready to run and had no core. Writes
+benchmarks/results/engines.json.
 """
 
 import argparse
@@ -17,6 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +40,47 @@ def nothing(task: Task) -> None:
     """A task without work."""
 
 
-def rate(sweep: Path, out: Path, **engine: Any) -> float:
-    """Finished runs per second, between the first and the last."""
-    times: list[float] = []
-    run_sweep(sweep, out, progress=lambda done, total: times.append(time.perf_counter()), **engine)
-    return (len(times) - 2) / (times[-1] - times[1])
+@dataclass(frozen=True)
+class Rate:
+    """Finished runs per second, by the clock and with cores of their own for the workers."""
+
+    by_clock: float
+    undisturbed: float
+    cpu_per_run: float
+
+
+def used(pids: Sequence[int]) -> tuple[float, float]:
+    """Seconds that the threads of these processes ran, and waited for a core."""
+    ran = waited = 0.0
+    for pid in pids:
+        for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            words = file.read_text().split()
+            ran, waited = ran + int(words[0]) / 1e9, waited + int(words[1]) / 1e9
+    return ran, waited
+
+
+def children() -> list[int]:
+    own = Path(f"/proc/{os.getpid()}/task")
+    found = [int(pid) for file in own.glob("*/children") for pid in file.read_text().split()]
+    return [pid for pid in found if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def rate(sweep: Path, out: Path, workers: Sequence[int] | None, **engine: Any) -> Rate:
+    """Throughput between the second and the last finished run.
+
+    Processes of the workers: as given, or the child processes where None.
+    """
+    samples: list[tuple[float, float, float]] = []
+
+    def sample(done: int, total: int) -> None:
+        samples.append((time.perf_counter(), *used(children() if workers is None else workers)))
+
+    run_sweep(sweep, out, progress=sample, **engine)
+    runs = len(samples) - 3  # the first call comes before anything is done
+    wall, ran, waited = (last - first for first, last in zip(samples[2], samples[-1], strict=True))
+    n_workers = 1 if engine.get("workers") == 1 else 2
+    idle = max(0.0, n_workers * wall - ran - waited)
+    return Rate(runs / wall, runs * n_workers / (ran + idle), ran / runs)
 
 
 def overhead(workers: int, scheduler: str | None) -> float:
@@ -54,7 +96,7 @@ def cluster(folder: Path) -> tuple[str, list["subprocess.Popen[bytes]"]]:
     file = folder / "scheduler.json"
     dask = [sys.executable, "-m", "dask"]
     commands = [[*dask, "scheduler", "--host", "127.0.0.1", "--port", "0"]]
-    commands += [[*dask, "worker", "--nworkers", "1", "--nthreads", "1"]] * 2
+    commands += [[*dask, "worker", "--nworkers", "1", "--nthreads", "1", "--no-nanny"]] * 2
     paths = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
     processes = [
         subprocess.Popen(
@@ -74,7 +116,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--scenes", type=int, default=20)
     arguments = parser.parse_args()
-    rates: dict[str, list[float]] = {"one": [], "two": [], "dask": []}
+    rates: dict[str, list[Rate]] = {"one": [], "two": [], "dask": []}
     empty: dict[str, list[float]] = {"processes": [], "dask": []}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -86,28 +128,35 @@ def main() -> None:
         scheduler, processes = cluster(folder)
         try:
             for number in range(arguments.repeats):
-                for engine, options in (
-                    ("one", {"workers": 1}),
-                    ("two", {"workers": 2}),
-                    ("dask", {"scheduler": scheduler}),
-                ):
-                    rates[engine].append(rate(sweep, folder / f"{engine}{number}", **options))
+                out = folder / str(number)
+                ours, theirs = [os.getpid()], [process.pid for process in processes[1:]]
+                rates["one"].append(rate(sweep, out / "one", ours, workers=1))
+                rates["two"].append(rate(sweep, out / "two", None, workers=2))
+                rates["dask"].append(rate(sweep, out / "dask", theirs, scheduler=scheduler))
                 empty["processes"].append(overhead(2, None))
                 empty["dask"].append(overhead(2, scheduler))
         finally:
             for process in processes:
                 process.kill()
 
-    def ratio(above: str, below: str) -> dict[str, float]:
-        found = [a / b for a, b in zip(rates[above], rates[below], strict=True)]
-        return {"median": statistics.median(found), "least": min(found), "most": max(found)}
+    def ratio(above: str, below: str) -> dict[str, dict[str, float]]:
+        found = {}
+        for kind in ("by_clock", "undisturbed"):
+            pairs = zip(rates[above], rates[below], strict=True)
+            values = [getattr(a, kind) / getattr(b, kind) for a, b in pairs]
+            found[kind] = {
+                "median": statistics.median(values),
+                "least": min(values),
+                "most": max(values),
+            }
+        return found
 
     content = {
         "scenes": arguments.scenes,
         "repeats": arguments.repeats,
         "cores": len(os.sched_getaffinity(0)),
         "load": os.getloadavg()[0],
-        "runs_per_s": rates,
+        "runs_per_s": {name: [asdict(each) for each in found] for name, found in rates.items()},
         "two workers over one": ratio("two", "one"),
         "Dask over two processes": ratio("dask", "two"),
         "overhead_ms": {key: 1e3 * statistics.median(values) for key, values in empty.items()},

@@ -6,7 +6,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 SHARED = {"run_all.py", "synthetic_layer.py"}
-LONG = {"published_values.py"}  # hours; run it by hand, it resumes
+LONG = {"published_values.py", "fault_campaign.py"}  # run them by hand, they resume
 REPORTS = {"simulation_report.py"}  # written from the results of the others
 
 

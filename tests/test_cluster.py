@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import tifffile
 
 from cellquant import cluster
 from cellquant.engines import Task, execute
 from cellquant.errors import InputError
 from cellquant.sweep import run_sweep
+from examples import drifting_discs, shuffled
 
 pytest.importorskip("distributed", reason="Dask is not installed")
 
@@ -88,7 +90,8 @@ def start_cluster(tmp_path: Path) -> Iterator[Callable[[], Cluster]]:
 
 
 def tables(folder: Path) -> dict[str, bytes]:
-    files = [*folder.rglob("*.parquet"), *folder.rglob("summary.json")]
+    kinds = ("*.parquet", "summary.json", "statistics.json")
+    files = [path for kind in kinds for path in folder.rglob(kind)]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
@@ -131,6 +134,56 @@ def test_a_sweep_outlives_its_worker_and_its_scheduler(
     assert outcome.done + outcome.skipped == 6
     run_sweep(file, tmp_path / "alone")
     assert tables(out) == tables(tmp_path / "alone")
+
+
+STUDY = """
+[calibration]
+pixel_size = 0.65
+frame_interval = 10
+[[condition]]
+name = "c"
+[[condition.trial]]
+name = "day"
+stacks = ["*.tif"]
+"""
+LARGE = """
+seeds = [1, 2]
+[scene]
+cells = 600
+transient = 0
+duration = 6
+[grid]
+phi = [0.9, 0.97]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("command", ["run", "sweep"])
+def test_threads_workers_and_cluster_give_the_same_bytes(
+    command: str, start_cluster: Callable[[], Cluster], tmp_path: Path
+) -> None:
+    """Layers large enough for two threads, and four tasks for four workers."""
+    file = tmp_path / f"{command}.toml"
+    file.write_text({"run": STUDY, "sweep": LARGE}[command])
+    for number in range(4):
+        movie = shuffled(drifting_discs(26, side=3, step=(0.5, 0.1 * number)), number)
+        tifffile.imwrite(tmp_path / f"{number}.tif", movie)
+    found = {}
+    for name, threads, options in (
+        ("one thread", "1", []),
+        ("two threads", "2", []),
+        ("four workers", "2", ["--workers", "4"]),
+        ("cluster", "2", ["--scheduler", str(start_cluster().file)]),
+    ):
+        words = ["-m", "cellquant", command, str(file), "-o", str(tmp_path / name), *options]
+        environment = {**os.environ, "NUMBA_NUM_THREADS": threads}
+        subprocess.run([sys.executable, *words], check=True, env=environment)
+        found[name] = tables(tmp_path / name)
+    assert len(found["one thread"]) > 20
+    for name, content in found.items():
+        assert content.keys() == found["one thread"].keys(), name
+        assert [key for key in content if content[key] != found["one thread"][key]] == [], name
 
 
 @pytest.mark.slow

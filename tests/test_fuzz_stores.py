@@ -44,7 +44,7 @@ from cellquant.tables import (
     read_tracks,
     write_table,
 )
-from test_io_fuzz import CAMPAIGN, COMMON, HOSTILE, campaign, edited_bytes, only_input_errors
+from test_io_fuzz import COMMON, HOSTILE, PARTS, campaign, edited_bytes, only_input_errors
 
 QUICK = 60
 
@@ -361,11 +361,12 @@ def test_nested_brackets_do_not_crash_the_reader(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(7200)
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("part", range(PARTS))
 @pytest.mark.parametrize(
     ("cases", "check"),
     [(parquets(), check_parquet), (stores(), check_store), (tomls(), check_toml)],
     ids=["parquet", "zarr", "toml"],
 )
-def test_campaign(cases: st.SearchStrategy[Any], check: Callable[[Any], None]) -> None:
-    assert campaign(cases, check) >= CAMPAIGN
+def test_campaign(cases: st.SearchStrategy[Any], check: Callable[[Any], None], part: int) -> None:
+    campaign(cases, check, part)

@@ -58,6 +58,7 @@ class _Interruption:
 def _interrupt(number: int, frame: FrameType | None) -> None:
     _Interruption.asked = True
     # What was under way may swallow the exception: a compiler does, or a finaliser.
+    sys.unraisablehook = lambda _: None
     last = threading.Timer(GRACE, os._exit, (130,))
     last.daemon = True
     last.start()
