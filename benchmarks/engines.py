@@ -1,6 +1,6 @@
 """What the engines cost: throughput of two workers, overhead per task, Dask against processes.
 
-    python benchmarks/engines.py [--repeats 3] [--scenes 20]
+    python benchmarks/engines.py [--repeats 3] [--scenes 20] [--append]
 
 A sweep of small scenes with one worker, with two, and on a Dask cluster of two local worker
 processes, in turn, repeated; the throughput counts from the second to the last finished run, since
@@ -10,7 +10,7 @@ tasks that do nothing. Ratios are medians over the repetitions, with their range
 On a machine that others use, a worker waits for a core that it would have alone. The system counts
 that time (``/proc/PID/schedstat``), so each ratio stands there twice: as the clock gives it, and
 with the time left out in which a worker was ready to run and had no core. Writes
-benchmarks/results/engines.json.
+benchmarks/results/engines.json; with --append the repetitions of earlier calls count too.
 """
 
 import argparse
@@ -115,9 +115,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--append", action="store_true")
     arguments = parser.parse_args()
     rates: dict[str, list[Rate]] = {"one": [], "two": [], "dask": []}
     empty: dict[str, list[float]] = {"processes": [], "dask": []}
+    if arguments.append:
+        before = json.loads(RESULTS.read_text())
+        rates = {k: [Rate(**each) for each in found] for k, found in before["runs_per_s"].items()}
+        empty = before["seconds per empty task"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sweep = folder / "sweep.toml"
@@ -153,12 +158,13 @@ def main() -> None:
 
     content = {
         "scenes": arguments.scenes,
-        "repeats": arguments.repeats,
+        "repeats": len(rates["one"]),
         "cores": len(os.sched_getaffinity(0)),
         "load": os.getloadavg()[0],
         "runs_per_s": {name: [asdict(each) for each in found] for name, found in rates.items()},
         "two workers over one": ratio("two", "one"),
         "Dask over two processes": ratio("dask", "two"),
+        "seconds per empty task": empty,
         "overhead_ms": {key: 1e3 * statistics.median(values) for key, values in empty.items()},
     }
     RESULTS.write_text(json.dumps(content, indent=2) + "\n")

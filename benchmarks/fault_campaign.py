@@ -1,6 +1,6 @@
 """Faults at random moments of a study and of a sweep: the same command then ends in equal bytes.
 
-    python benchmarks/fault_campaign.py [--kills 220] [--errors 40] [--commands 24] [--job run]
+    python benchmarks/fault_campaign.py [--kills 200] [--errors 24] [--commands 12] [--job run]
 
 Each fault strikes a job in an empty folder. Whatever stands there then under its final name must
 be readable; the job is given again, without a fault, and every table, summary, stack report and
@@ -357,9 +357,9 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=220)
-    parser.add_argument("--errors", type=int, default=40)
-    parser.add_argument("--commands", type=int, default=24)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--errors", type=int, default=24)
+    parser.add_argument("--commands", type=int, default=12)
     parser.add_argument("--job", choices=("run", "sweep"), help="both when absent")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--results", type=Path, default=HERE / "results")

@@ -37,7 +37,7 @@ def write_stack(path: Path, *, seed: int, step: float = 0.5) -> None:
 
 
 @pytest.fixture
-def study(tmp_path: Path) -> Path:
+def full_study(tmp_path: Path) -> Path:
     """Two conditions with a trial each, two stacks in the first."""
     for name, seed in (("a/one", 1), ("a/two", 2), ("b/three", 3)):
         write_stack(tmp_path / f"{name}.tif", seed=seed)
@@ -48,6 +48,13 @@ def study(tmp_path: Path) -> Path:
     return tmp_path / "experiment.toml"
 
 
+@pytest.fixture
+def study(full_study: Path) -> Path:
+    """The same with few observables."""
+    full_study.write_text(full_study.read_text() + '\n[observables]\nonly = ["shape_index", "msd"]')
+    return full_study
+
+
 def tables(folder: Path) -> dict[str, bytes]:
     """Content of every table and summary, which must not depend on time, machine or workers."""
     kinds = ("*.parquet", "summary.json", "statistics.json", "stacks/**/report.html")
@@ -55,9 +62,9 @@ def tables(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_a_study_is_worked_through_once(study: Path, tmp_path: Path) -> None:
+def test_a_study_is_worked_through_once(full_study: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    first = run_experiment(study, out)
+    first = run_experiment(full_study, out)
     assert (first.done, first.skipped, first.failures) == (3, 0, {})
     stacks = pd.read_parquet(out / "stacks.parquet")
     assert stacks["stack"].tolist() == ["one", "two", "three"]
@@ -71,7 +78,7 @@ def test_a_study_is_worked_through_once(study: Path, tmp_path: Path) -> None:
     assert json.loads((out / "run.json").read_text())["counts"] == {"failed": 0, "stacks": 3}
     before = {path: path.stat().st_mtime_ns for path in (out / "stacks").rglob("*.parquet")}
 
-    again = run_experiment(study, out)
+    again = run_experiment(full_study, out)
     assert (again.done, again.skipped) == (0, 3)
     assert before == {p: p.stat().st_mtime_ns for p in (out / "stacks").rglob("*.parquet")}
 
@@ -86,22 +93,21 @@ def test_changed_input_and_configuration_are_worked_on_again(study: Path, tmp_pa
 
 
 def test_other_observables_are_measured_on_the_tracks_that_are_there(
-    study: Path, tmp_path: Path
+    full_study: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    run_experiment(study, out)
+    run_experiment(full_study, out)
     before = {path: path.stat().st_mtime_ns for path in out.rglob("tracks.parquet")}
-    study.write_text(study.read_text() + '\n[observables]\nonly = ["shape_index"]\n')
-    assert run_experiment(study, out).done == 3
+    full_study.write_text(full_study.read_text() + '\n[observables]\nonly = ["shape_index"]\n')
+    assert run_experiment(full_study, out).done == 3
     assert before == {path: path.stat().st_mtime_ns for path in out.rglob("tracks.parquet")}
     assert not list((out / "stacks").rglob("msd.parquet"))
-    run_experiment(study, tmp_path / "fresh")
+    run_experiment(full_study, tmp_path / "fresh")
     assert tables(out) == tables(tmp_path / "fresh")
 
 
 def test_parts_of_a_job_array_and_the_gathering(study: Path, tmp_path: Path) -> None:
     """The lines of the script run here as SLURM would run them on its nodes."""
-    study.write_text(study.read_text() + '\n[observables]\nonly = ["shape_index"]\n')
     out = tmp_path / "out"
     command = [sys.executable, "-m", "cellquant", "run", str(study), "-o", str(out)]
     emitted = subprocess.run(
@@ -144,9 +150,9 @@ def test_one_bad_stack_does_not_stop_the_others(study: Path, tmp_path: Path) -> 
     assert (mended.done, mended.skipped, mended.failures) == (1, 2, {})
 
 
-def test_workers_do_not_change_a_byte(study: Path, tmp_path: Path) -> None:
-    run_experiment(study, tmp_path / "one")
-    run_experiment(study, tmp_path / "two", workers=2)
+def test_workers_do_not_change_a_byte(full_study: Path, tmp_path: Path) -> None:
+    run_experiment(full_study, tmp_path / "one")
+    run_experiment(full_study, tmp_path / "two", workers=2)
     one, two = tables(tmp_path / "one"), tables(tmp_path / "two")
     assert one.keys() == two.keys()
     assert [name for name in one if one[name] != two[name]] == []

@@ -51,6 +51,17 @@ class Options:
     use_images: bool = True
 
 
+@dataclass(frozen=True)
+class Compared:
+    """Candidate links (L,) whose images were compared: source, place among the candidates, what
+    was seen (L, Y) and what that depends on in any pair (L, C); see `PairImages.pairs`."""
+
+    source: IntArray
+    column: IntArray
+    look: FloatArray
+    context: FloatArray
+
+
 @dataclass
 class Solution:
     """Links with the model that they were judged by; refined from pass to pass."""
@@ -68,8 +79,7 @@ class Solution:
     links: Links | None = None
     divisions: Divisions | None = None
     probability: FloatArray | None = None
-    look: FloatArray | None = None
-    context: FloatArray | None = None
+    compared: "Compared | None" = None
     cue: Cue | None = None
     family_cue: Cue | None = None
     gain: FloatArray | None = None
@@ -199,24 +209,21 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
 
 def _add_images(state: Solution, images: PairImages) -> None:
     """Add image correlation to the gains, calibrated on the present links."""
-    movie, links, gain = state.movie, state.links, state.gain
+    links, gain = state.links, state.gain
     assert links is not None
     assert gain is not None
-    if state.look is None or state.context is None:
-        state.look, state.context = _compare(state, images)
-    targets = np.maximum(state.candidates, 0)
-    measured = np.isfinite(state.look).all(axis=2)
-    linked = (links.after[:, None] == state.candidates) & (links.second < 0)[:, None]
-    stranger = links.before[targets] != np.arange(movie.n_cells)[:, None]
-    stranger &= state.context[:, :, -1] < 1.0
-    state.cue = fit_cue(
-        state.look[measured], state.context[measured], linked[measured], stranger[measured]
-    )
+    if state.compared is None:
+        state.compared = _compare(state, images)
+    seen = state.compared
+    target = state.candidates[seen.source, seen.column]
+    linked = (links.after[seen.source] == target) & (links.second[seen.source] < 0)
+    stranger = (links.before[target] != seen.source) & (seen.context[:, -1] < 1.0)
+    state.cue = fit_cue(seen.look, seen.context, linked, stranger)
     if state.cue is not None:
-        gain[measured] += state.cue.odds(state.look[measured], state.context[measured])
+        gain[seen.source, seen.column] += state.cue.odds(seen.look, seen.context)
 
 
-def _compare(state: Solution, images: PairImages) -> tuple[FloatArray, FloatArray]:
+def _compare(state: Solution, images: PairImages) -> Compared:
     """Compare doubtful cells with their candidates, and a sample of the others to calibrate."""
     movie, candidates = state.movie, state.candidates
     assert state.probability is not None
@@ -225,17 +232,16 @@ def _compare(state: Solution, images: PairImages) -> tuple[FloatArray, FloatArra
     wanted[:: max(1, movie.n_cells // _CALIBRATION_CELLS)] = True
     wanted &= ~movie.cut
     whole = (candidates >= 0) & ~movie.cut[candidates]
-    look = np.full((*candidates.shape, images.n_values), np.nan)
-    context = np.zeros((*candidates.shape, CONTEXTS))
+    rows, columns = np.nonzero(wanted[:, None] & whole)
+    look, context = np.empty((len(rows), images.n_values)), np.empty((len(rows), CONTEXTS))
+    ends = np.searchsorted(rows, movie.start)
     for index in range(len(movie.time) - 1):
-        here = movie.cells_of(index)
-        row, column = np.nonzero(wanted[here, None] & whole[here])
-        if len(row):
-            row += here.start
-            look[row, column], context[row, column] = images.pairs(
-                index, row, candidates[row, column]
-            )
-    return look, context
+        here = slice(ends[index], ends[index + 1])
+        if here.start < here.stop:
+            row, column = rows[here], columns[here]
+            look[here], context[here] = images.pairs(index, row, candidates[row, column])
+    known = np.isfinite(look).all(axis=1)
+    return Compared(rows[known], columns[known], look[known], context[known])
 
 
 def _families(
