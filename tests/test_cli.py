@@ -36,7 +36,7 @@ def program(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 def cellquant(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """The same in this process, which has loaded everything already."""
     written, told, code = io.StringIO(), io.StringIO(), 0
-    handler = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     command = ["cellquant", *map(str, arguments)]
     with (
         pytest.MonkeyPatch.context() as patch,
@@ -49,7 +49,8 @@ def cellquant(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
         except SystemExit as stop:
             code = int(stop.code or 0)
         finally:
-            signal.signal(signal.SIGTERM, handler)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
     return subprocess.CompletedProcess(command, code, written.getvalue(), told.getvalue())
 
 
