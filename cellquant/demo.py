@@ -154,7 +154,11 @@ _UNITS = {
 def _per_cent(share: float) -> str:
     from cellquant.compare.page import MINUS
 
-    return "not known" if isnan(share) else f"{100 * share:+.2f} %".replace("-", MINUS)
+    return (
+        "not known"
+        if isnan(share)
+        else f"{100 * share:+.2f}\N{NO-BREAK SPACE}%".replace("-", MINUS)
+    )
 
 
 _STEP_TEXTS = (

@@ -24,6 +24,7 @@ from cellquant.compare.comparison import (
     judge,
     unit_mapping,
 )
+from cellquant.compare.comparison_page import command_of
 from cellquant.compare.groups import Group, read_groups
 from cellquant.compare.matching import Matched, matched_scalars
 from cellquant.compare.page import format_value
@@ -333,6 +334,20 @@ def test_what_is_refused(movie, tmp_path: Path) -> None:
         cq.compare(movie.result("a"), movie.result("b"), names=["x", "y", "z"])
     with pytest.raises(InputError, match="steric_area must be > 0"):
         cq.compare(movie.result("a"), movie.result("b"), steric_area=(0.0, 1.0))
+
+
+def test_the_command_that_makes_the_page_again_names_what_was_given() -> None:
+    def command(**options: object) -> list[str]:
+        made = {"sources": ["a study", "sweep"], "steric_area": list(STERIC_AREA), **options}
+        return shlex.split(command_of(Comparison((), settings=made)))
+
+    plain = ["cellquant", "compare", "a study", "sweep", "-o", "report.html"]
+    assert command(fit=False) == plain
+    assert command(fit=True, seed=3, units=None) == [*plain, "--fit", "--seed", "3"]
+    given = command(fit=True, seed=3, units="my units.toml")
+    assert given == [*plain, "--fit", "--seed", "3", "--units", "my units.toml"]
+    assert command(fit=False, steric_area=[300.0, 20.5])[-3:] == ["--steric-area", "300", "20.5"]
+    assert command(fit=True, seed=0, units="in memory") == []
 
 
 def test_same_names_are_told_apart(movie) -> None:

@@ -48,20 +48,26 @@ def compare(
             "lengths and times."
         ),
     ] = None,
+    steric_area: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="UM^2 ERROR",
+            help="Area that a cell takes in a dense layer and its standard error, for the "
+            "effective packing fraction of movies; 400 to 500 um^2 when not given, as for HeLa.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the fit.")] = 0,
 ) -> None:
     """Put experiments and simulations side by side: a report, and comparison.json beside it."""
     from cellquant.compare import compare as compare_results
+    from cellquant.compare.units import STERIC_AREA
     from cellquant.storage import check_output
 
     check_output(output.parent)
     with step("compare"):
-        known = None
-        if units is not None:
-            from cellquant.compare.ranking import units_of_file
-
-            known = units_of_file(units)
-        comparison = compare_results(*sources, fit=fit, units=known, seed=seed)
+        comparison = compare_results(
+            *sources, steric_area=steric_area or STERIC_AREA, fit=fit, units=units, seed=seed
+        )
         comparison.to_html(output)
         comparison.to_json(output.with_name("comparison.json"))
     for first, second in comparison.pairs():

@@ -12,7 +12,7 @@ import numpy as np
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 LEVELS = (0.68, 0.95)
-CONFIDENCE = 0.8
+CONFIDENCE = 0.95
 STEP = 1.04
 LARGEST = 4.0
 
@@ -41,7 +41,7 @@ def inflation_for(forecasts: Sequence[Forecast], *, size: int) -> float:
 
     Of n scenes, k must lie in their region of probability P, for 0.68 and for 0.95: the smallest k
     with which a new case that resembles the scenes lies in its region with a chance of P or more,
-    with a confidence of 0.8; all of them where n is too small for that. The chance that k of n
+    with a confidence of 0.95; all of them where n is too small for that. The chance that k of n
     stand for is distributed as Beta(k, n + 1 - k), whatever made the regions too small.
 
     Parameters

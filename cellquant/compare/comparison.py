@@ -160,7 +160,7 @@ def compare(
     names: Sequence[str] | None = None,
     steric_area: tuple[float, float] = STERIC_AREA,
     fit: bool = False,
-    units: "Units | None" = None,
+    units: "Units | str | Path | None" = None,
     seed: int = 0,
 ) -> Comparison:
     """Hold experiments and simulations against each other.
@@ -179,7 +179,8 @@ def compare(
         Whether to rank the simulated scenes and estimate phi, v0 and eta for each experiment (for
         the first group where all are simulated).
     units
-        L0 and t0 in the experiments' units, for the fit; pure numbers only when None.
+        L0 and t0 in the experiments' units, for the fit, or a file that fixes them; pure numbers
+        only when None.
     seed
         Seed of the fit.
 
@@ -208,7 +209,12 @@ def compare(
         "fit": fit,
     }
     if fit:
-        settings |= {"seed": seed, "L0": units and list(units.length),
+        origin = None if units is None else "in memory"
+        if isinstance(units, str | Path):
+            from cellquant.compare.ranking import units_of_file
+
+            origin, units = str(units), units_of_file(units)
+        settings |= {"seed": seed, "units": origin, "L0": units and list(units.length),
                      "t0": units and list(units.time)}  # fmt: skip
     found = [read_study(s) for s in sources if isinstance(s, str | Path)]
     studies = tuple(study for study in found if study is not None)
@@ -217,7 +223,8 @@ def compare(
         return comparison
     from cellquant.compare.fit import fit_groups
 
-    return replace(comparison, fits=tuple(fit_groups(comparison, units=units, seed=seed)))
+    known = None if isinstance(units, str | Path) else units
+    return replace(comparison, fits=tuple(fit_groups(comparison, units=known, seed=seed)))
 
 
 def judge(first: Matched, second: Matched) -> Verdict:

@@ -46,6 +46,7 @@ from cellquant.compare.study_figures import (
     relaxation_figure,
 )
 from cellquant.compare.study_tables import statistics_section
+from cellquant.compare.units import STERIC_AREA
 
 
 def build_comparison(comparison: Comparison) -> Page:
@@ -96,9 +97,9 @@ _SHAPE = (
 )
 _RELAXATION = (
     "F_{s}(q, t) tells how much of the layer is still where it was, at the scale of a cell. Time "
-    "is given in units of each side's own relaxation time τ_{α}, so the curves meet at 1/e by "
-    "construction and their form is what is compared; the scale above each drawing gives the "
-    "side's own unit of time.",
+    "is given in units of each side's own relaxation time τ_{α}, the mean over its trials: a "
+    "single recording falls to 1/e at 1, a mean over trials close to it. What is compared is the "
+    "form of the curves; the scale above each drawing gives the side's own unit of time.",
 )
 _MOTION = ("Distances are in units of the mean cell diameter d, times in units of τ_{α}.",)
 _MAPS = (
@@ -154,16 +155,18 @@ def _glance(comparison: Comparison, pairs: Pairs) -> tuple[Headline, ...]:
     return tuple(items)
 
 
-def _command(comparison: Comparison) -> str:
+def command_of(comparison: Comparison) -> str:
     """The command that makes the page again; empty for results in memory."""
     settings = comparison.settings
     sources = settings.get("sources", ())
-    if not sources or "in memory" in sources:
+    if not sources or "in memory" in [*sources, settings.get("units")]:
         return ""
     words = ["cellquant", "compare", *sources, "-o", "report.html"]
+    if settings["steric_area"] != list(STERIC_AREA):
+        words += ["--steric-area", *(f"{v:g}" for v in settings["steric_area"])]
     if settings.get("fit"):
         words += ["--fit", "--seed", str(settings["seed"])]
-        words += ["--units", "units.toml"] if settings.get("L0") else []
+        words += ["--units", settings["units"]] if settings["units"] else []
     return shlex.join(words)
 
 
@@ -174,7 +177,7 @@ def _methods(comparison: Comparison, groups: Sequence[Group]) -> Section:
     section = replace(
         section,
         settings=(Settings("Settings of compare", flatten(made)), *section.settings),
-        commands="\n".join(filter(None, (section.commands, _command(comparison)))),
+        commands="\n".join(filter(None, (section.commands, command_of(comparison)))),
     )
     more = len(recorded) - MAX_TABLES
     if more <= 0:

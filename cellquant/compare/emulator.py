@@ -1,8 +1,8 @@
 """What a layer shows at any phi, v0 and eta, learned from the scenes of a sweep."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from cellquant.compare.groups import SCENE_KEYS, Group
 from cellquant.compare.ranking import REDUCED_UNITS, Units, features_of
 from cellquant.errors import InputError
 
+if TYPE_CHECKING:
+    from cellquant.compare.processes import Process
+
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
-LeftOut = Callable[[int, Sequence[int]], tuple[FloatArray, FloatArray]]
 # Of errors inside one recording: 16 to 25 spatial blocks, the smaller number less one.
 BLOCK_FREEDOM = 15
-FACTORS = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0)
-CALIBRATION_SCENES = 100  # at most this many scenes are left out in turn
-CALIBRATION_POINTS = 2**22  # points times scenes, which bounds the memory
+FOLDS = 8
 
 
 @dataclass(frozen=True)
@@ -76,15 +76,13 @@ class Emulator:
     ----------
     names, features
         Parameters and features.
-    models
+    processes
         One process per feature.
     error_law
         (1 + parameters, features) logarithm of the error of a run as a linear function.
-    scatter
-        Factor by which each feature scatters between runs more than the error estimated inside
-        a single one says.
     widen
-        Factor >= 1 on the error of each, from predicting every scene without itself.
+        Factor >= 1 on the errors of emulator and single runs, from predicting scenes with
+        processes that never saw them.
     low, high
         Range of each parameter in the sweep.
     correlation
@@ -96,9 +94,8 @@ class Emulator:
 
     names: tuple[str, ...]
     features: tuple[str, ...]
-    models: tuple[Any, ...]
+    processes: "tuple[Process, ...]"
     error_law: FloatArray
-    scatter: FloatArray
     widen: FloatArray
     low: FloatArray
     high: FloatArray
@@ -108,9 +105,9 @@ class Emulator:
     def predict(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, (n, features), of the expected feature."""
         scaled = _scaled(points, self.low, self.high)
-        pairs = [model.predict(scaled, return_std=True) for model in self.models]
-        deviation = np.column_stack([p[1] for p in pairs]) * self.widen
-        return np.column_stack([p[0] for p in pairs]), deviation
+        pairs = [process.predict(scaled) for process in self.processes]
+        deviation = np.column_stack([pair[1] for pair in pairs]) * self.widen
+        return np.column_stack([pair[0] for pair in pairs]), deviation
 
     def single_run_error(self, points: FloatArray, error: FloatArray) -> FloatArray:
         """Errors (n, features) of one recording: its scatter between recordings included.
@@ -120,7 +117,8 @@ class Emulator:
         """
         law = _with_constant(_scaled(points, self.low, self.high)) @ self.error_law
         size = (np.log(error) - law).mean(axis=1, keepdims=True)
-        out: FloatArray = self.scatter * np.exp(law + size)
+        scatter = np.array([process.scatter for process in self.processes]) * self.widen
+        out: FloatArray = scatter * np.exp(law + size)
         return out
 
     def log_likelihood(self, points: FloatArray, observed: Observed) -> FloatArray:
@@ -148,42 +146,45 @@ class Emulator:
         out: FloatArray = np.hypot(deviation, own)
         return out
 
-    def _calibrated(self, points: FloatArray, scenes: Sequence[Group]) -> "Emulator":
-        """Widen all errors until scenes left out of the sweep are found in their regions.
+    def _calibrated(
+        self, points: FloatArray, scenes: Sequence[Group], folds: Sequence["Fold"]
+    ) -> "Emulator":
+        """Widen all errors until scenes that the processes never saw are found in their regions.
 
         For layers seen once each scene is taken by its first run alone, for others by all it has.
         """
         from scipy.stats import qmc
 
-        count, size = points.shape
-        number = 2 ** int(np.log2(min(2 ** (10 + 2 * size), CALIBRATION_POINTS / count)))
-        grid = self.low + qmc.Sobol(size, seed=0).random(number) * (self.high - self.low)
-        chosen = np.unique(np.linspace(0, count - 1, min(count, CALIBRATION_SCENES)).astype(int))
+        size = len(self.names)
+        grid = qmc.scale(qmc.Sobol(size, seed=0).random(2 ** (8 + 2 * size)), self.low, self.high)
+        several = any(scene.n > 1 for scene in scenes)
         forecasts: dict[bool, list[Forecast]] = {True: [], False: []}
-        left_out = [
-            _left_out_predictions(model, _scaled(np.vstack([grid, points]), self.low, self.high))
-            for model in self.models
-        ]
-        for scene in chosen:
-            rows = [*range(number), number + scene]
-            pairs = [one(scene, rows) for one in left_out]
-            mean = np.column_stack([pair[0] for pair in pairs])
-            deviation = np.column_stack([pair[1] for pair in pairs]) * self.widen
-            place = np.vstack([grid, points[scene : scene + 1]])
-            whole = scenes[scene]
-            first = replace(whole, trials=dict([next(iter(whole.trials.items()))]))
-            for single, group in ((True, first), (False, whole)):
-                observed = observed_features(group, self.features, REDUCED_UNITS)
-                spread = self._spread(place, deviation, observed)
-                z = np.linalg.solve(
-                    np.linalg.cholesky(self.correlation), ((observed.value - mean) / spread).T
-                )
-                forecasts[single].append(
-                    Forecast((z**2).sum(axis=0), np.log(spread).sum(axis=1), observed.freedom)
-                )
-        widths = (inflation_for(forecasts[True], size=len(self.features)),
-                  inflation_for(forecasts[False], size=len(self.features)))  # fmt: skip
-        return replace(self, inflation=widths)
+        likeness = np.linalg.cholesky(self.correlation)
+        for fold in folds:
+            part = replace(self, processes=fold.processes)
+            mean, deviation = part.predict(np.vstack([grid, points[fold.scenes]]))
+            for place, scene in enumerate(fold.scenes):
+                rows = [*range(len(grid)), len(grid) + place]
+                where = np.vstack([grid, points[scene : scene + 1]])
+                whole = scenes[scene]
+                first = replace(whole, trials=dict([next(iter(whole.trials.items()))]))
+                for group in (first, whole) if several else (first,):
+                    observed = observed_features(group, self.features, REDUCED_UNITS)
+                    spread = part._spread(where, deviation[rows], observed)
+                    z = np.linalg.solve(likeness, ((observed.value - mean[rows]) / spread).T)
+                    forecasts[group is first].append(
+                        Forecast((z**2).sum(axis=0), np.log(spread).sum(axis=1), observed.freedom)
+                    )
+        once = inflation_for(forecasts[True], size=len(self.features))
+        often = inflation_for(forecasts[False], size=len(self.features)) if several else once
+        return replace(self, inflation=(once, often))
+
+
+class Fold(NamedTuple):
+    """Scenes set aside, and processes that learned from the others alone."""
+
+    scenes: list[int]
+    processes: "tuple[Process, ...]"
 
 
 def train(candidates: Sequence[Group], features: Sequence[str]) -> Emulator:
@@ -202,6 +203,8 @@ def train(candidates: Sequence[Group], features: Sequence[str]) -> Emulator:
         If there are fewer than eight scenes, or no parameter varies.
     """
     from threadpoolctl import threadpool_limits
+
+    from cellquant.compare.processes import learn
 
     tables = [features_of(group, REDUCED_UNITS) for group in candidates]
     known = [
@@ -222,59 +225,47 @@ def train(candidates: Sequence[Group], features: Sequence[str]) -> Emulator:
     values = np.array([[table[f].value for f in features] for _, table in known])
     errors = np.array([[table[f].std_error for f in features] for _, table in known])
     scaled = _scaled(points, low, high)
-    with threadpool_limits(1):
-        # The errors of single runs scatter themselves: log-linear functions take their place.
-        error_law = np.linalg.lstsq(_with_constant(scaled), np.log(errors), rcond=None)[0]
-        smooth = np.exp(_with_constant(scaled) @ error_law)
-        fitted = [
-            _gaussian_process(scaled, values[:, i], smooth[:, i]) for i in range(len(features))
-        ]
-    models, factors = zip(*fitted, strict=True)
-    residuals = np.column_stack([_left_out_residuals(model) for model in models])
-    widen = np.maximum(1.0, np.sqrt((residuals**2).mean(axis=0)))
-    emulator = Emulator(
-        names,
-        tuple(features),
-        models,
-        error_law,
-        np.array(factors),
-        widen,
-        low,
-        high,
-        _correlation(residuals),
-    )
-    with threadpool_limits(1):
-        return emulator._calibrated(points, [group for group, _ in known])
+    # The errors of single runs scatter themselves: log-linear functions take their place.
+    law = np.linalg.lstsq(_with_constant(scaled), np.log(errors), rcond=None)[0]
 
-
-def _gaussian_process(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[Any, float]:
-    """Fit a process to a feature, and the factor by which runs scatter more than their errors say.
-
-    The factor is that of the largest marginal likelihood.
-    """
-    import warnings
-
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
-
-    spread = float(y.std()) or 1.0
-    best: tuple[Any, float] | None = None
-    for factor in FACTORS:
-        smooth = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.full(x.shape[1], 1.0), (0.15, 20.0))
-        trend = ConstantKernel(1.0, (1e-3, 1e3)) * DotProduct(1.0, (1e-2, 1e2))
-        model = GaussianProcessRegressor(
-            smooth + trend, alpha=(factor * error / spread) ** 2 + 1e-6, normalize_y=True
+    with threadpool_limits(1):  # the matrices are too small for more to pay
+        whole = tuple(learn(scaled, values[:, i], law[:, i]) for i in range(len(features)))
+        folds = []
+        for aside in folds_of(len(scaled)):
+            x, y = np.delete(scaled, aside, axis=0), np.delete(values, aside, axis=0)
+            folds.append(
+                Fold(
+                    aside, tuple(learn(x, y[:, i], law[:, i], start=p) for i, p in enumerate(whole))
+                )
+            )
+        residuals = np.vstack([_residuals(fold, scaled, values, law) for fold in folds])
+        emulator = Emulator(
+            names,
+            tuple(features),
+            whole,
+            law,
+            np.maximum(1.0, np.sqrt((residuals**2).mean(axis=0))),
+            low,
+            high,
+            _correlation(residuals),
         )
-        with warnings.catch_warnings():
-            # A length scale at its bound: the feature does not depend on that parameter.
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            model.fit(x, y)
-        likelihood = model.log_marginal_likelihood_value_
-        if best is None or likelihood > best[0].log_marginal_likelihood_value_:
-            best = model, factor
-    assert best is not None
-    return best
+        return emulator._calibrated(points, [group for group, _ in known], folds)
+
+
+def folds_of(count: int) -> list[list[int]]:
+    """Scenes in up to eight parts of equal size, drawn at random, the same in every run."""
+    order = np.random.default_rng(0).permutation(count)
+    return [sorted(order[start::FOLDS].tolist()) for start in range(min(count, FOLDS))]
+
+
+def _residuals(fold: Fold, x: FloatArray, values: FloatArray, law: FloatArray) -> FloatArray:
+    """Residuals (scenes, features) of scenes set aside, over their predicted errors."""
+    out = np.empty((len(fold.scenes), len(fold.processes)))
+    for i, process in enumerate(fold.processes):
+        mean, deviation = process.predict(x[fold.scenes])
+        noise = process.scatter * np.exp(_with_constant(x[fold.scenes]) @ law[:, i])
+        out[:, i] = (values[fold.scenes, i] - mean) / np.hypot(deviation, noise)
+    return out
 
 
 def _with_constant(x: FloatArray) -> FloatArray:
@@ -289,43 +280,6 @@ def _scaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray
     curved = np.log(safe[0] / safe[1]) / np.where(wide, np.log(safe[2] / safe[1]), 1.0)
     out: FloatArray = np.where(wide, curved, straight)
     return out
-
-
-def _left_out_residuals(model: Any) -> FloatArray:
-    """Residuals of each scene predicted without itself, over their predicted errors.
-
-    With K the covariance of the data, the residual of point i predicted from the others is
-    ``[K^-1 y]_i / [K^-1]_ii`` and its variance ``1 / [K^-1]_ii`` (Rasmussen & Williams, 5.4.2).
-    """
-    covariance = model.kernel_(model.X_train_) + np.diag(model.alpha)
-    inverse = np.linalg.inv(covariance)
-    residuals: FloatArray = (inverse @ model.y_train_) / np.sqrt(np.diag(inverse))
-    return residuals
-
-
-def _left_out_predictions(model: Any, points: FloatArray) -> "LeftOut":
-    """Predictions at points (n, parameters) of a process that has not seen one of its data.
-
-    With ``w = K(points, X) K^-1``, leaving out datum i lowers the mean by
-    ``w_i [K^-1 y]_i / [K^-1]_ii`` and raises the variance by
-    ``w_i^2 / [K^-1]_ii``; the hyperparameters are kept.
-    """
-    kernel, data = model.kernel_, model.X_train_
-    inverse = np.linalg.inv(kernel(data) + np.diag(model.alpha))
-    between = kernel(points, data)
-    weight = between @ inverse
-    mean = weight @ model.y_train_
-    variance = kernel.diag(points) - (weight * between).sum(axis=1)
-    scale, offset = model._y_train_std, model._y_train_mean
-    pull = inverse @ model.y_train_
-
-    def without(datum: int, rows: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        own, part = inverse[datum, datum], weight[rows, datum]
-        middle = (mean[rows] - part * pull[datum] / own) * scale + offset
-        spread = np.sqrt(np.maximum(variance[rows] + part**2 / own, 0.0)) * scale
-        return middle, spread
-
-    return without
 
 
 def _correlation(residuals: FloatArray) -> FloatArray:
