@@ -63,6 +63,7 @@ def run_demo(out: str | Path, *, seed: int = 1, step: Step = silent) -> Path:
     page = _analyse_recording(folder / "recording", record, step)
     loop = close_loop(scene, folder / "layer", step=step)
     record.stages += loop.record.stages
+    record.settings = {**record.settings, "closed_loop": dict(loop.settings)}
     report = folder / "report.html"
     with record.stage("report"), step("report"):
         section = _loop_section(folder / "layer", loop, scene)

@@ -106,6 +106,10 @@ def test_the_true_scene_ranks_first(sweep: list[Group]) -> None:
     assert first.distance < found.ranks[1].distance
     assert "P(p)" in found.features
     assert sum(rank.best_probability for rank in found.ranks) == pytest.approx(1.0)
+    assert (
+        found.statement()
+        == f"{first.name} is closest, in {first.best_probability:.0%} of the draws."
+    )
 
 
 def test_equal_candidates_are_not_distinguishable(sweep: list[Group]) -> None:
@@ -118,6 +122,34 @@ def test_equal_candidates_are_not_distinguishable(sweep: list[Group]) -> None:
     assert "not distinguishable from" in found.statement()
     assert found.ranks[-1].best_probability == 0.0
     assert found.ranks[-1].interval == (3, 3)
+
+
+def test_chance_of_being_the_closest_is_that_of_the_errors() -> None:
+    """One number, errors of 1 and 2 combined apart: the chance from ten thousand plain draws."""
+
+    def layer(name: str, mean: float) -> Group:
+        result = toy(0.92, 0.03, 0.03, seed=0)
+        summary = {**result.summary, "tau_alpha": {}, "speed": {},
+                   "shape_index": {"mean": mean, "std_error": 0.004, "n": 9}}  # fmt: skip
+        return Group(name, True, {"1": (replace(result, summary=summary, tables={}),)}, {})
+
+    apart = 0.004 * np.sqrt(2)
+    scenes = [layer("near", 3.8), layer("off", 3.8 + apart), layer("far", 3.8 + 8 * apart)]
+    found = {rank.name: rank for rank in rank_candidates(layer("t", 3.8), scenes).ranks}
+    rng = np.random.default_rng(1)
+    ours = rng.normal(3.8, 0.004, 10_000)
+    theirs = [rng.normal(3.8 + step * apart, 0.004, 10_000) for step in (0, 1, 8)]
+    closest = np.argmin([np.abs(one - ours) for one in theirs], axis=0)
+    for number, name in enumerate(("near", "off", "far")):
+        assert found[name].best_probability == pytest.approx((closest == number).mean(), abs=0.03)
+    assert 0.1 < found["off"].best_probability < 0.4
+    ranking = rank_candidates(layer("t", 3.8), scenes)
+    assert ranking.statement() == "near is closest, but not distinguishable from off."
+    lone = rank_candidates(layer("t", 3.8 - 3 * apart), scenes[1:])
+    assert lone.statement() == (
+        "off is closest, in 100% of the draws. "
+        "It does not match: 4.0 combined standard errors apart."
+    )
 
 
 def test_ranking_depends_on_the_seed_alone(sweep: list[Group]) -> None:

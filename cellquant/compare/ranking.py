@@ -18,6 +18,7 @@ from cellquant.compare.units import convert_units_file
 from cellquant.errors import InputError
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+MATCH = 2.0  # mean distance in combined standard errors up to which a scene is said to match
 LEVEL = 0.05  # chance of being the best below which a scene is told apart from the best one
 
 
@@ -175,12 +176,16 @@ class Ranking:
         return (first, *(r for r in rest if r.best_probability >= LEVEL))
 
     def statement(self) -> str:
-        """In words: which scene matches best, and which cannot be told apart from it."""
+        """In words: which scene is closest, which cannot be told apart from it, if they match."""
         first, *others = self.not_distinguishable
-        if not others:
-            return f"{first.name} matches best ({first.best_probability:.0%} of the draws)."
         names = "; ".join(rank.name for rank in others)
-        return f"{first.name} is closest, but not distinguishable from {names}."
+        if others:
+            found = f"{first.name} is closest, but not distinguishable from {names}."
+        else:
+            found = f"{first.name} is closest, in {first.best_probability:.0%} of the draws."
+        if first.distance <= MATCH:
+            return found
+        return f"{found} It does not match: {first.distance:.1f} combined standard errors apart."
 
 
 def rank_candidates(
