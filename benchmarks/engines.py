@@ -1,6 +1,6 @@
 """What the engines cost: throughput of two workers, overhead per task, Dask against processes.
 
-    python benchmarks/engines.py [--repeats 3] [--scenes 20] [--append]
+    python benchmarks/engines.py [--repeats 3] [--scenes 20] [--pair dask two] [--append]
 
 A sweep of small scenes with one worker, with two, and on a Dask cluster of two local worker
 processes, in turn, repeated; the throughput counts from the second to the last finished run, since
@@ -34,6 +34,7 @@ from cellquant.sweep import run_sweep
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "engines.json"
 EMPTY = 200
+ENGINES = ("one", "two", "dask")
 
 
 def nothing(task: Task) -> None:
@@ -65,7 +66,7 @@ def children() -> list[int]:
     return [pid for pid in found if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
-def rate(sweep: Path, out: Path, workers: Sequence[int] | None, **engine: Any) -> Rate:
+def rate(sweep: Path, out: Path, pids: Sequence[int] | None, **engine: Any) -> Rate:
     """Throughput between the second and the last finished run.
 
     Processes of the workers: as given, or the child processes where None.
@@ -73,7 +74,7 @@ def rate(sweep: Path, out: Path, workers: Sequence[int] | None, **engine: Any) -
     samples: list[tuple[float, float, float]] = []
 
     def sample(done: int, total: int) -> None:
-        samples.append((time.perf_counter(), *used(children() if workers is None else workers)))
+        samples.append((time.perf_counter(), *used(children() if pids is None else pids)))
 
     run_sweep(sweep, out, progress=sample, **engine)
     runs = len(samples) - 3  # the first call comes before anything is done
@@ -85,90 +86,110 @@ def rate(sweep: Path, out: Path, workers: Sequence[int] | None, **engine: Any) -
 
 def overhead(workers: int, scheduler: str | None) -> float:
     """Seconds per empty task, once the workers are there."""
-    tasks = [{"number": number} for number in range(EMPTY)]
+    tasks: list[Task] = [{"number": number} for number in range(EMPTY)]
     times = []
     for _ in execute(nothing, tasks, workers=workers, scheduler=scheduler):
         times.append(time.perf_counter())
     return (times[-1] - times[workers]) / (len(times) - workers - 1)
 
 
-def cluster(folder: Path) -> tuple[str, list["subprocess.Popen[bytes]"]]:
-    file = folder / "scheduler.json"
-    dask = [sys.executable, "-m", "dask"]
-    commands = [[*dask, "scheduler", "--host", "127.0.0.1", "--port", "0"]]
-    commands += [[*dask, "worker", "--nworkers", "1", "--nthreads", "1", "--no-nanny"]] * 2
-    paths = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
-    processes = [
-        subprocess.Popen(
-            [*command, "--no-dashboard", "--scheduler-file", str(file)],
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": paths},
-        )
-        for command in commands
-    ]
-    while not file.exists():
-        time.sleep(0.1)
-    return str(file), processes
+class Cluster:
+    """A Dask scheduler and two worker processes with one thread each, where they are wanted."""
+
+    def __init__(self, folder: Path, wanted: bool) -> None:
+        self.scheduler = str(folder / "scheduler.json")
+        self.processes: list[subprocess.Popen[bytes]] = []
+        dask = [sys.executable, "-m", "dask"]
+        commands = [[*dask, "scheduler", "--host", "127.0.0.1", "--port", "0"]]
+        commands += [[*dask, "worker", "--nworkers", "1", "--nthreads", "1", "--no-nanny"]] * 2
+        paths = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+        for command in commands if wanted else ():
+            process = subprocess.Popen(
+                [*command, "--no-dashboard", "--scheduler-file", self.scheduler],
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": paths},
+            )
+            self.processes.append(process)
+        while wanted and not Path(self.scheduler).exists():
+            time.sleep(0.1)
+        self.workers = [process.pid for process in self.processes[1:]]
+
+    def __enter__(self) -> "Cluster":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for process in self.processes:
+            process.kill()
+
+
+def repetition(sweep: Path, out: Path, pair: Sequence[str], cluster: "Cluster") -> dict[str, Any]:
+    """The sweep on these engines."""
+    engines: dict[str, tuple[Sequence[int] | None, dict[str, Any]]] = {
+        "one": ([os.getpid()], {"workers": 1}),
+        "two": (None, {"workers": 2}),
+        "dask": (cluster.workers, {"scheduler": cluster.scheduler}),
+    }
+    row: dict[str, Any] = {"load": os.getloadavg()[0]}
+    for engine in pair:
+        pids, options = engines[engine]
+        row[engine] = asdict(rate(sweep, out / engine, pids, **options))
+        print(engine, row[engine], file=sys.stderr, flush=True)
+    return row
+
+
+def ratios(rows: list[dict[str, Any]], above: str, below: str) -> dict[str, Any]:
+    """Median and range of a ratio over the repetitions that have both engines."""
+    pairs = [(row[above], row[below]) for row in rows if above in row and below in row]
+    found: dict[str, Any] = {"repetitions": len(pairs)}
+    for kind in ("by_clock", "undisturbed"):
+        values = [one[kind] / other[kind] for one, other in pairs]
+        if values:
+            found[kind] = {
+                "median": statistics.median(values),
+                "least": min(values),
+                "most": max(values),
+            }
+    return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--pair", nargs=2, choices=ENGINES, help="two engines, no empty tasks")
+    parser.add_argument("--empty", action="store_true", help="empty tasks alone")
     parser.add_argument("--append", action="store_true")
     arguments = parser.parse_args()
-    rates: dict[str, list[Rate]] = {"one": [], "two": [], "dask": []}
-    empty: dict[str, list[float]] = {"processes": [], "dask": []}
-    if arguments.append:
-        before = json.loads(RESULTS.read_text())
-        rates = {k: [Rate(**each) for each in found] for k, found in before["runs_per_s"].items()}
-        empty = before["seconds per empty task"]
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        sweep = folder / "sweep.toml"
+    before = json.loads(RESULTS.read_text()) if arguments.append else {}
+    rows = before.get("repetitions", [])
+    empty = before.get("ms per empty task", {"two": [], "dask": []})
+    pair = () if arguments.empty else arguments.pair or ENGINES
+    with (
+        tempfile.TemporaryDirectory() as name,
+        Cluster(Path(name), "dask" in pair or arguments.empty) as cluster,
+    ):
+        sweep = Path(name) / "sweep.toml"
         sweep.write_text(
             f"seeds = {list(range(1, arguments.scenes + 1))}\n"
             "[scene]\ncells = 64\ntransient = 2\nduration = 30\n"
         )
-        scheduler, processes = cluster(folder)
-        try:
-            for number in range(arguments.repeats):
-                out = folder / str(number)
-                ours, theirs = [os.getpid()], [process.pid for process in processes[1:]]
-                rates["one"].append(rate(sweep, out / "one", ours, workers=1))
-                rates["two"].append(rate(sweep, out / "two", None, workers=2))
-                rates["dask"].append(rate(sweep, out / "dask", theirs, scheduler=scheduler))
-                empty["processes"].append(overhead(2, None))
-                empty["dask"].append(overhead(2, scheduler))
-        finally:
-            for process in processes:
-                process.kill()
-
-    def ratio(above: str, below: str) -> dict[str, dict[str, float]]:
-        found = {}
-        for kind in ("by_clock", "undisturbed"):
-            pairs = zip(rates[above], rates[below], strict=True)
-            values = [getattr(a, kind) / getattr(b, kind) for a, b in pairs]
-            found[kind] = {
-                "median": statistics.median(values),
-                "least": min(values),
-                "most": max(values),
-            }
-        return found
-
+        for number in range(arguments.repeats):
+            if pair:
+                row = repetition(sweep, Path(name) / str(number), pair, cluster)
+                rows.append({"scenes": arguments.scenes, **row})
+            if not arguments.pair:
+                empty["two"].append(1e3 * overhead(2, None))
+                empty["dask"].append(1e3 * overhead(2, cluster.scheduler))
     content = {
-        "scenes": arguments.scenes,
-        "repeats": len(rates["one"]),
         "cores": len(os.sched_getaffinity(0)),
-        "load": os.getloadavg()[0],
-        "runs_per_s": {name: [asdict(each) for each in found] for name, found in rates.items()},
-        "two workers over one": ratio("two", "one"),
-        "Dask over two processes": ratio("dask", "two"),
-        "seconds per empty task": empty,
-        "overhead_ms": {key: 1e3 * statistics.median(values) for key, values in empty.items()},
+        "two workers over one": ratios(rows, "two", "one"),
+        "Dask over two processes": ratios(rows, "dask", "two"),
+        "overhead_ms": {key: statistics.median(values) for key, values in empty.items() if values},
+        "ms per empty task": empty,
+        "repetitions": rows,
     }
     RESULTS.write_text(json.dumps(content, indent=2) + "\n")
-    print(json.dumps(content, indent=2))
+    print(json.dumps({k: v for k, v in content.items() if k != "repetitions"}, indent=2))
 
 
 if __name__ == "__main__":
