@@ -170,7 +170,8 @@ def open_source(
 ) -> "Tracks | Cells | Any":
     """Open what can be observed: tracks, cells, a simulated run, or label masks for shapes alone.
 
-    Only the columns that the wanted observables read are loaded or measured.
+    Tables stay on disk, to be read in pieces; of a run or of masks only the columns that the
+    wanted observables read are made.
 
     Parameters
     ----------
@@ -190,7 +191,7 @@ def open_source(
         If the path is missing or is none of these, or a name is unknown.
     """
     from cellquant.observables import columns_read, needs_tracks
-    from cellquant.tables import read_cells, read_tracks
+    from cellquant.rows import scan_cells, scan_tracks
 
     shapes_only = only is not None and not needs_tracks(only)
     source = Path(source)
@@ -202,12 +203,12 @@ def open_source(
         return open_run(source).to_tracks(columns=columns_read(only))
     if source.is_dir() and (source / "tracks.parquet").is_file():
         if shapes_only and (source / "cells.parquet").is_file():
-            return read_cells(source, columns=columns_read(only, of_cells=True))
-        return read_tracks(source, columns=columns_read(only))
+            return scan_cells(source, columns=columns_read(only, of_cells=True))
+        return scan_tracks(source, columns=columns_read(only))
     if source.suffix == ".parquet":
         if source.name.startswith("cells"):
-            return read_cells(source, columns=columns_read(only, of_cells=True))
-        return read_tracks(source, columns=columns_read(only))
+            return scan_cells(source, columns=columns_read(only, of_cells=True))
+        return scan_tracks(source, columns=columns_read(only))
     if not shapes_only:
         raise InputError(
             f"{source} holds neither tracks nor a simulated run; make tracks with "
@@ -289,8 +290,6 @@ def _observe(data: Any, record: RunRecord, options: Mapping[str, Any], step: Ste
 
 def _file_of(source: Path, data: Any) -> Path:
     """Return the file inside a source folder that the observables were computed from."""
-    from cellquant.tables import Cells
+    from cellquant.rows import Scan
 
-    if not (source / "tracks.parquet").is_file():
-        return source
-    return source / ("cells.parquet" if isinstance(data, Cells) else "tracks.parquet")
+    return data.path if isinstance(data, Scan) else source

@@ -149,7 +149,9 @@ class Tracks:
         write_table(self.table, path, units=self.units, metadata=metadata)
 
 
-def read_cells(path: str | Path, *, columns: Sequence[str] | None = None) -> Cells:
+def read_cells(
+    path: str | Path, *, columns: Sequence[str] | None = None, rows: bool = True
+) -> Cells:
     """Read cells written by `Cells.write`.
 
     Parameters
@@ -158,6 +160,8 @@ def read_cells(path: str | Path, *, columns: Sequence[str] | None = None) -> Cel
         A parquet file, or a folder that holds ``cells.parquet``.
     columns
         Names out of `CELL_COLUMNS`: only these are read; all of them when None.
+    rows
+        Whether rows are read; without them the table is empty.
 
     Raises
     ------
@@ -167,7 +171,9 @@ def read_cells(path: str | Path, *, columns: Sequence[str] | None = None) -> Cel
     path = Path(path)
     if path.is_dir():
         path = path / "cells.parquet"
-    table, units, metadata = read_table(path, kind="cells", columns=columns or list(CELL_COLUMNS))
+    table, units, metadata = read_table(
+        path, kind="cells", columns=columns or list(CELL_COLUMNS), rows=rows
+    )
     try:
         width, height = metadata["field_of_view"]
         return Cells(
@@ -187,7 +193,9 @@ def read_cells(path: str | Path, *, columns: Sequence[str] | None = None) -> Cel
         ) from error
 
 
-def read_tracks(path: str | Path, *, columns: Sequence[str] | None = None) -> Tracks:
+def read_tracks(
+    path: str | Path, *, columns: Sequence[str] | None = None, rows: bool = True
+) -> Tracks:
     """Read tracks written by `Tracks.write`.
 
     Parameters
@@ -196,6 +204,8 @@ def read_tracks(path: str | Path, *, columns: Sequence[str] | None = None) -> Tr
         A parquet file, or a folder that holds ``tracks.parquet``.
     columns
         Names out of `TRACK_COLUMNS`: only these are read; all of them when None.
+    rows
+        Whether rows are read; without them the table is empty.
 
     Returns
     -------
@@ -209,7 +219,9 @@ def read_tracks(path: str | Path, *, columns: Sequence[str] | None = None) -> Tr
     path = Path(path)
     if path.is_dir():
         path = path / "tracks.parquet"
-    table, units, metadata = read_table(path, kind="tracks", columns=columns or list(TRACK_COLUMNS))
+    table, units, metadata = read_table(
+        path, kind="tracks", columns=columns or list(TRACK_COLUMNS), rows=rows
+    )
     try:
         box = metadata["box"]
         return Tracks(
@@ -258,7 +270,11 @@ def write_table(
 
 
 def read_table(
-    path: str | Path, *, kind: str = "", columns: Sequence[str] | None = None
+    path: str | Path,
+    *,
+    kind: str = "",
+    columns: Sequence[str] | None = None,
+    rows: bool = True,
 ) -> tuple[pd.DataFrame, Units, dict[str, Any]]:
     """Read a table written by `write_table`.
 
@@ -270,6 +286,8 @@ def read_table(
         What the table holds, for the message when a column is missing.
     columns
         The columns to read, all of which must be there; whatever there is when None.
+    rows
+        Whether rows are read; without them the table is empty.
 
     Returns
     -------
@@ -298,6 +316,8 @@ def read_table(
                 "make one with 'cellquant track MASKS -o DIR'."
             )
         wanted = list(schema.names if columns is None else columns)
+        if not rows:
+            return pd.DataFrame({name: np.empty(0) for name in wanted}), units, metadata
         texts = [name for name in text_columns(schema) if name in wanted]
         arrow = decode_texts(path, pq.read_table(path, columns=wanted, read_dictionary=texts))
         # Each column is freed as soon as it is converted, or the table would be held twice.

@@ -15,8 +15,8 @@ from cellquant.observables.dynamics import (
     self_intermediate_scattering,
 )
 from cellquant.observables.relaxation import relaxation_time
+from cellquant.observables.smoothing import from_tracks
 from cellquant.observables.structure import structure_factor
-from cellquant.observables.trajectories import from_tracks
 from cellquant.observables.vanhove import self_van_hove
 from observables_examples import brownian, persistent, tracks_of
 

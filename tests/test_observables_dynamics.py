@@ -19,8 +19,8 @@ from cellquant.observables.dynamics import (
     scattering_average,
     self_intermediate_scattering,
 )
-from cellquant.observables.trajectories import from_tracks, log_lags
-from cellquant.observables.windows import RowsByFrame, Window
+from cellquant.observables.smoothing import from_tracks
+from cellquant.observables.trajectories import log_lags
 from cellquant.tables import Tracks
 from observables_examples import brownian, tracks_of, with_gaps
 
@@ -239,11 +239,16 @@ def test_lags_are_distinct_and_reach_both_ends(max_lag: int, n: int) -> None:
 
 
 def test_pooling_windows_adds_their_pairs(gappy: Tracks) -> None:
-    rows = RowsByFrame(gappy.table)
-    halves = [rows.inside(Window(0, 15)), rows.inside(Window(15, 30))]
-    assert halves[1]["frame"].between(15, 29).all()
-    assert sum(map(len, halves)) == gappy.table["frame"].lt(30).sum()
-    parts = [scattering_average(from_tracks(replace(gappy, table=h)), 5.0) for h in halves]
+    paths, frame = from_tracks(gappy), gappy.table["frame"]
+    halves = [paths.inside(0, 15), paths.inside(15, 30)]
+    assert sum(int(half.valid.sum()) for half in halves) == len(gappy.table)
+    for half, rows in zip(halves, (frame < 15, frame >= 15), strict=True):
+        cut = from_tracks(replace(gappy, table=gappy.table[rows]))
+        for name in ("x", "y", "start", "centre"):
+            np.testing.assert_allclose(getattr(half, name), getattr(cut, name), atol=1e-14)
+        for name in ("valid", "offsets", "first_frame", "origin_frame", "n_frames"):
+            np.testing.assert_array_equal(getattr(half, name), getattr(cut, name))
+    parts = [scattering_average(half, 5.0) for half in halves]
     whole = pool(parts).table()
     assert whole["n_pairs"].sum() == sum(p.counts.sum() for p in parts)
     by_lag = whole.set_index("lag_time")["value"]

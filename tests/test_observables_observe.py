@@ -224,6 +224,20 @@ def test_pixels_have_no_density_bins() -> None:
     assert observed.tables["relaxation_times"]["bin_centre"].isna().all()
 
 
+def test_densities_outside_every_bin_and_short_movies_leave_reasons() -> None:
+    tracks = movie(np.random.default_rng(13))
+    sparse = observe(tracks, only=["windows"], bin_centres=[2350.0, 2600.0])
+    assert len(sparse.tables["relaxation_times"]) == 0
+    assert sparse.statistics["mixed_model"] == {}
+    reason = sparse.statistics["mixed_model_reason"]
+    assert reason == sparse.summary["windows_reason"]
+    assert "1500 to 1500 1/mm^2, all outside the bins from 2225 to 2725" in reason
+    short = observe(tracks, only=["windows"], window=61)
+    assert short.summary["windows"] == []
+    assert "60 frames, fewer than the 61" in short.summary["windows_reason"]
+    assert "nothing to compare" in short.statistics["mann_whitney_reason"]
+
+
 EXTREMES = {
     "no rows": lambda rng: tracks_of(np.empty((0, 30, 2)), area=1.0),
     "one track": lambda rng: brownian(rng, 1, 60),

@@ -106,19 +106,3 @@ def test_blocks_are_compact_and_of_equal_size(n: int) -> None:
     if n >= 64:
         within = np.mean([np.var(place[blocks.index == b], axis=0).sum() for b in range(blocks.n)])
         assert within < 0.2 * np.var(place, axis=0).sum()
-
-
-def test_constant_shape_stays_constant_while_cells_shrink() -> None:
-    # Eight trials in which the radius falls from 16 to 9 px; P/sqrt(A) is the same for all.
-    rng = np.random.default_rng(6)
-    means = []
-    for radius in np.linspace(16, 9, 8):
-        n = int(40000 / radius**2)
-        place = rng.uniform(0, 500, (n, 1, 2))
-        tracks = tracks_of(
-            np.repeat(place, 24, axis=1),
-            cell_area=np.pi * radius**2 * rng.lognormal(0, 0.1, (n, 24)),
-            shape_index=3.9 + 0.02 * rng.gamma(2, 1, (n, 24)),
-        )
-        means.append(observe(tracks, only=["shape_index"]).summary["shape_index"]["mean"])
-    assert np.ptp(means) / np.mean(means) < 0.003

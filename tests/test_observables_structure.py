@@ -50,7 +50,7 @@ def test_ideal_gas_has_no_structure() -> None:
     assert pull.std() == pytest.approx(1, abs=0.3)
     assert found.peak["q_peak"] is None
     assert "scatter of independent" in found.peak["reason"]
-    g = pair_correlation(tracks, diameter=1.0)
+    g = pair_correlation(tracks, diameter=1.0).table
     assert ((g["value"] - 1) / g["std_error"]).std() == pytest.approx(1, abs=0.4)
 
 
@@ -60,7 +60,7 @@ def test_ideal_gas_in_an_open_field_has_no_structure() -> None:
     table = structure_factor(tracks, diameter=1.0).table
     far = table[table["wave_number"] > 2]
     assert far["value"].mean() == pytest.approx(1, abs=0.02)
-    g = pair_correlation(tracks, diameter=1.0, max_distance=6.0)
+    g = pair_correlation(tracks, diameter=1.0, max_distance=6.0).table
     # The exact cover of the rectangle keeps g = 1 out to nearly half the edge.
     assert g["value"].iloc[-20:].mean() == pytest.approx(1, abs=0.02)
 
@@ -80,7 +80,7 @@ def test_triangular_lattice() -> None:
     assert order.neighbour_summary["mean"] == pytest.approx(6)
     assert order.neighbours["n_neighbours"].tolist() == [6]
     g = pair_correlation(tracks, diameter=1.0)
-    assert g["distance"][g["value"].idxmax()] == pytest.approx(1, abs=0.05)
+    assert g.table["distance"][g.table["value"].idxmax()] == pytest.approx(1, abs=0.05)
 
 
 def test_global_order_of_random_points_is_small() -> None:
@@ -118,7 +118,7 @@ def test_hexatic_order_and_distances_agree_with_freud() -> None:
     assert found.summary["mean"] == pytest.approx(np.abs(peer.particle_order).mean(), rel=2e-5)
     rdf = freud.density.RDF(bins=40, r_max=4.0, normalization_mode="finite_size")
     rdf.compute((box, points), reset=True)
-    g = pair_correlation(tracks, max_distance=4.0, bin_width=0.1)
+    g = pair_correlation(tracks, max_distance=4.0, bin_width=0.1).table
     np.testing.assert_allclose(g["value"], rdf.rdf, atol=0.02)
 
 
@@ -139,7 +139,7 @@ def test_too_few_cells_give_reasons(n: int) -> None:
     order = bond_order(tracks)
     assert order.summary["mean"] is None
     assert order.summary["reason"]
-    assert len(pair_correlation(tracks)) == 0 or n >= 2
+    assert len(pair_correlation(tracks).table) == 0 or n >= 2
 
 
 def test_cells_on_a_line_and_cells_on_one_spot() -> None:
@@ -148,9 +148,24 @@ def test_cells_on_a_line_and_cells_on_one_spot() -> None:
         tracks = tracks_of(place)
         assert structure_factor(tracks).peak["q_peak"] is None
         assert bond_order(tracks).summary["mean"] is None
-        assert len(pair_correlation(tracks)) == 0
+        assert len(pair_correlation(tracks).table) == 0
 
 
 def test_frames_are_spread_evenly() -> None:
     tracks = brownian(np.random.default_rng(9), 30, 100, box=(5.5, 5.5))
     assert bond_order(tracks, max_frames=5).hexatic["frame"].tolist() == [0, 25, 50, 74, 99]
+
+
+def test_the_first_peak_of_pairs_within_its_error() -> None:
+    # A lattice of spacing 1 that trembles: the peak of g(r) lies at 1, its error is small.
+    rng = np.random.default_rng(10)
+    place, box = triangular(14)
+    moved = place[:, None] + rng.normal(0, 0.06, (196, 12, 2))
+    found = pair_correlation(tracks_of(moved, box=box), diameter=1.0).peak
+    # The factor 1/r of g(r) draws it in by the squared width of the distances, 0.0036 here.
+    assert abs(found["peak_distance"] - 0.9964) < 4 * found["peak_distance_std_error"]
+    assert 0 < found["peak_distance_std_error"] < 0.01
+    assert 0 < found["peak_height_std_error"] < 0.05 * found["peak_height"]
+    seen = [pair_correlation(gas(rng, n=60, frames=2)).peak for _ in range(20)]
+    assert sum(peak["peak_distance"] is not None for peak in seen) <= 1
+    assert "nowhere stands out" in seen[0]["reason"]

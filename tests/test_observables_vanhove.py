@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from cellquant.observables.trajectories import Trajectories, from_tracks
-from cellquant.observables.vanhove import displacements, self_van_hove
+from cellquant.observables.motion import displacements
+from cellquant.observables.smoothing import from_tracks
+from cellquant.observables.trajectories import Trajectories
+from cellquant.observables.vanhove import self_van_hove
 from observables_examples import brownian, tracks_of
 
 
@@ -105,7 +107,7 @@ def test_components_agree_with_trackpy() -> None:
 
     tracks = brownian(np.random.default_rng(5), 30, 40)
     found = self_van_hove(from_tracks(tracks), 4)
-    dx, dy, _ = displacements(from_tracks(tracks), 4)
+    dx, dy, *_ = displacements(from_tracks(tracks), 4)
     wide = tracks.table.pivot(index="frame", columns="track_id", values="x")
     edges = np.linspace(-1, 1, 21)
     peer = trackpy.motion.vanhove(wide, 4, mpp=1.0, ensemble=True, bins=edges)

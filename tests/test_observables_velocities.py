@@ -12,7 +12,7 @@ from cellquant.observables.correlations import (
 )
 from cellquant.observables.dynamics import displacement_moments, mean_square_displacement
 from cellquant.observables.motion import growth_exponent, speeds
-from cellquant.observables.trajectories import from_tracks
+from cellquant.observables.smoothing import from_tracks
 from observables_examples import brownian, persistent, tracks_of, with_gaps
 
 
@@ -105,6 +105,8 @@ def test_correlation_length_of_a_wave() -> None:
     found = velocity_correlation(from_tracks(tracks), bin_width=0.5, max_distance=9.0)
     # <v.v> at distance r is J0(k r).
     assert found.summary["correlation_length"] == pytest.approx(1.755 / k, rel=0.05)
+    error = found.summary["correlation_length_std_error"]
+    assert 0 < error < 0.1 * found.summary["correlation_length"]
 
 
 def test_cage_relative_motion_agrees_with_a_loop() -> None:

@@ -7,7 +7,6 @@ from cellquant.observables.observe import (
     needs_tracks,
     observe,
 )
-from cellquant.observables.smoothing import remove_drift, retain, smooth_tracks
 
 __all__ = [
     "Observables",
@@ -15,7 +14,4 @@ __all__ = [
     "columns_read",
     "needs_tracks",
     "observe",
-    "remove_drift",
-    "retain",
-    "smooth_tracks",
 ]

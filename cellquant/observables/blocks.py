@@ -6,10 +6,11 @@ spread of the result over the groups gives its error.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from cellquant.observables.smoothing import FloatArray, IntArray
+from cellquant.observables.trajectories import FloatArray
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Blocks:
         How the blocks were made, in words, for ``std_error_method``.
     """
 
-    index: IntArray
+    index: Any
     n: int
     method: str
 

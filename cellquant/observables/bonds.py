@@ -13,9 +13,9 @@ from cellquant.observables.blocks import (
     ratio_with_error,
     sum_by_block,
 )
-from cellquant.observables.shape import cell_blocks
-from cellquant.observables.smoothing import FloatArray, IntArray
-from cellquant.observables.structure import layer_of, positions_by_frame
+from cellquant.observables.structure import Layer, blocks_of, layer_of, positions_by_frame
+from cellquant.observables.trajectories import FloatArray, IntArray
+from cellquant.rows import Scan
 from cellquant.tables import Cells, Tracks
 
 
@@ -94,7 +94,7 @@ class BondOrder:
     neighbour_summary: dict[str, Any]
 
 
-def bond_order(source: Tracks | Cells, *, max_frames: int = 32) -> BondOrder:
+def bond_order(source: Tracks | Cells | Scan | Layer, *, max_frames: int = 32) -> BondOrder:
     """Hexatic bond order and number of Delaunay neighbours.
 
     ``psi_6(j) = z_j^-1 sum_k exp(6 i theta_jk)`` over the z_j Delaunay neighbours k of cell j;
@@ -104,7 +104,7 @@ def bond_order(source: Tracks | Cells, *, max_frames: int = 32) -> BondOrder:
     Parameters
     ----------
     source
-        Tracks or cells.
+        Tracks, cells, or a layer.
     max_frames
         Frames used, evenly spaced.
 
@@ -147,7 +147,7 @@ def bond_order(source: Tracks | Cells, *, max_frames: int = 32) -> BondOrder:
         empty = empty.astype({"n_neighbours": "int64", "n": "int64"})
         return BondOrder(hexatic, {**none, "global": None}, empty, {**none, "std": None})
     used = layer.rows[counted]
-    blocks = cell_blocks(used, tuple(layer.edges) if layer.periodic else None)
+    blocks = blocks_of(layer, counted)
     summary = _mean(np.abs(psi[counted]), blocks)
     # The global order of each frame without each block in turn, averaged over frames.
     frame = np.searchsorted(layer.frames, used["frame"].to_numpy())

@@ -1,58 +1,61 @@
 """What several observables share, each made once and only when an observable asks for it."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from cellquant.observables.blocks import jackknife_error, leave_one_out, sum_by_block
+from cellquant.observables.blocks import ratio_with_error, sum_by_block
 from cellquant.observables.settings import Settings
-from cellquant.observables.shape import cell_blocks
-from cellquant.observables.smoothing import (
-    leave_out_cut_cells,
-    longest_runs,
-    ordered_rows,
-    remove_drift,
-    retain,
-)
-from cellquant.observables.smoothing import smooth_tracks as smooth
+from cellquant.observables.shape import pooled
 from cellquant.observables.windows import (
     WINDOW_POINTS,
-    RowsByFrame,
+    Census,
     Window,
-    mean_diameter,
+    count_by_frame,
+    density_per_frame,
+    diameter_by_frame,
     split_frames,
+    usable_area,
 )
+from cellquant.rows import Piece, Scan
 from cellquant.tables import Cells, Tracks
 
 if TYPE_CHECKING:
     from cellquant.observables.dynamics import LagAverage
     from cellquant.observables.fits import StretchedExponential
     from cellquant.observables.relaxation import RelaxationTime
+    from cellquant.observables.smoothing import Survey
     from cellquant.observables.trajectories import Trajectories
 
 
 class Context:
     """A source of observables, its settings, and what has been derived from it so far."""
 
-    def __init__(self, source: Tracks | Cells, settings: Settings, wanted: Sequence[str]) -> None:
+    def __init__(
+        self, source: Tracks | Cells | Scan, settings: Settings, wanted: Sequence[str]
+    ) -> None:
         self.source = source
         self.settings = settings
         self.wanted = frozenset(wanted)
 
     @property
+    def head(self) -> Tracks | Cells:
+        """The source, of which only what is beside its rows may be used."""
+        return self.source.head if isinstance(self.source, Scan) else self.source
+
+    @property
     def box(self) -> tuple[float, float] | None:
         """Edges of the periodic box, or None."""
-        return self.source.box if isinstance(self.source, Tracks) else None
+        return self.head.box if isinstance(self.head, Tracks) else None
 
     @property
     def tracks(self) -> Tracks:
-        """The source, where it is known to be tracks."""
-        assert isinstance(self.source, Tracks)
-        return self.source
+        """The head, where it is known to be that of tracks."""
+        assert isinstance(self.head, Tracks)
+        return self.head
 
     @property
     def smoothing(self) -> int:
@@ -68,12 +71,22 @@ class Context:
         return WINDOW_POINTS if self.box is None else max(self.n_frames, 2)
 
     @cached_property
+    def census(self) -> Census:
+        """Rows per frame."""
+        return count_by_frame(self.source)
+
+    @cached_property
+    def per_frame(self) -> pd.DataFrame:
+        """Density of every frame."""
+        return density_per_frame(self.source, self.census)
+
+    @property
     def frame_range(self) -> tuple[int, int]:
         """Half-open range of frame numbers."""
-        if isinstance(self.source, Cells):
-            return 0, self.source.n_frames
-        frame = self.source.table["frame"]
-        return (int(frame.min()), int(frame.max()) + 1) if len(frame) else (0, 0)
+        if isinstance(self.head, Cells):
+            return 0, self.head.n_frames
+        first = self.census.first_frame
+        return first, first + self.census.n_frames
 
     @property
     def n_frames(self) -> int:
@@ -86,63 +99,60 @@ class Context:
         return split_frames(self.frame_range[0], self.n_frames, self.window_points)
 
     @cached_property
-    def contours(self) -> pd.DataFrame:
-        """Rows whose shape can be measured: away from the border, with a finite shape index."""
-        table = self.source.table
-        rows = ~table["touches_border"].to_numpy(dtype=bool)
-        rows &= np.isfinite(table["shape_index"].to_numpy(dtype=np.float64))
-        kept: pd.DataFrame = table[rows]
-        return kept
+    def survey(self) -> "Survey":
+        """Drift of the population and tracks to retain."""
+        from cellquant.observables.smoothing import survey
 
-    @cached_property
-    def unsmoothed(self) -> Tracks:
-        """Retained tracks without cut cells, drift removed."""
-        tracks = self.tracks
-        if not self.settings.keep_cut_cells:
-            tracks = leave_out_cut_cells(tracks)
-        if self.settings.drift:
-            tracks = remove_drift(tracks)
-        return retain(tracks, self.settings.min_points)
+        settings = self.settings
+        return survey(
+            self._moving,
+            keep_cut_cells=settings.keep_cut_cells,
+            drift=settings.drift,
+            min_points=settings.min_points,
+        )
 
-    @cached_property
-    def smoothed(self) -> Tracks:
-        """Retained tracks, drift removed, smoothed unless the source came smoothed."""
-        if self.tracks.smoothing != 1:
-            return self.unsmoothed
-        return smooth(self.unsmoothed, self.smoothing)
+    @property
+    def _moving(self) -> Tracks | Scan:
+        assert not isinstance(self.source, Cells)
+        return self.source
 
-    @cached_property
-    def smoothed_rows(self) -> RowsByFrame:
-        """Rows of the smoothed tracks by frame."""
-        return RowsByFrame(self.smoothed.table)
+    def _trajectories(self) -> "Trajectories":
+        from cellquant.observables.smoothing import trajectories_of
 
-    @cached_property
-    def source_rows(self) -> RowsByFrame:
-        """Rows of the source by frame."""
-        return RowsByFrame(self.source.table)
-
-    @cached_property
-    def paths(self) -> "Trajectories":
-        """The smoothed tracks as arrays."""
-        from cellquant.observables.trajectories import from_tracks
-
-        return from_tracks(self.smoothed)
+        keep = self.settings.keep_cut_cells
+        return trajectories_of(self._moving, self.survey, keep_cut_cells=keep)
 
     @cached_property
     def unsmoothed_paths(self) -> "Trajectories":
-        """The unsmoothed tracks as arrays."""
-        from cellquant.observables.trajectories import from_tracks
+        """The retained tracks, drift removed, not smoothed."""
+        return self._trajectories()
 
-        return from_tracks(self.unsmoothed)
+    @property
+    def smoothed_over(self) -> int:
+        """Points of the moving average that the smoothed paths have been through."""
+        return self.smoothing if self.tracks.smoothing == 1 else self.tracks.smoothing
+
+    @cached_property
+    def paths(self) -> "Trajectories":
+        """The retained tracks, drift removed, smoothed unless the source came smoothed."""
+        from cellquant.observables.smoothing import smooth
+
+        if self.tracks.smoothing != 1 or self.smoothing == 1:
+            return self.unsmoothed_paths
+        if "van_hove" in self.wanted:  # which asks for the others too
+            return smooth(self.unsmoothed_paths, self.smoothing)
+        return smooth(self._trajectories(), self.smoothing, overwrite=True)
 
     @cached_property
     def no_motion(self) -> str | None:
         """Why nothing about motion can be measured; None when it can."""
-        if len(self.unsmoothed.table):
+        from cellquant.observables.smoothing import survey
+
+        if self.survey.kept.any():
             return None
-        if not len(self.tracks.table):
+        longest = survey(self._moving).longest_run
+        if not longest:
             return "there are no tracks"
-        longest = int(longest_runs(ordered_rows(self.tracks.table)).max())
         reason = (
             f"no track has {self.settings.min_points} consecutive points (the longest has "
             f"{longest}); min_points sets how many are asked for"
@@ -166,29 +176,43 @@ class Context:
     @cached_property
     def diameter(self) -> dict[str, Any]:
         """Mean diameter, its error and the rule."""
-        table = self.source.table
-        value, rows = mean_diameter(table)
-        if not np.isfinite(value):
+
+        def of_piece(piece: Piece) -> Any:
+            used = usable_area(piece)
+            return used, np.sqrt(4 * piece["area"][used] / np.pi)
+
+        d, blocks = pooled(self.source, ("area", "touches_border"), of_piece)
+        if not d.size:
             return {"mean_diameter": None, "mean_diameter_std_error": None}
-        used = table[rows]
-        blocks = cell_blocks(used, self.box)
-        d = np.sqrt(4 * used["area"].to_numpy(dtype=np.float64) / np.pi)
-        sums, counts = sum_by_block(d, blocks), sum_by_block(np.ones_like(d), blocks)
-        error = float("nan")
-        if blocks.n >= 2:
-            error = float(jackknife_error(leave_one_out(sums) / leave_one_out(counts)))
-        return {"mean_diameter": value, "mean_diameter_std_error": error}
+        sums = sum_by_block(d, blocks)
+        _, error = ratio_with_error(sums, sum_by_block(np.ones_like(d), blocks))
+        return {"mean_diameter": float(np.mean(d)), "mean_diameter_std_error": float(error)}
+
+    @cached_property
+    def layer(self) -> Any:
+        """Positions in the frames on which structure is measured."""
+        from cellquant.observables.structure import layer_of
+
+        return layer_of(self.source, max_frames=self.settings.max_frames)
+
+    @cached_property
+    def window_diameters(self) -> list[float]:
+        """Mean diameter in each window; NaN without a cell that has an area."""
+        frames = self.census.frame
+        total, count = diameter_by_frame(self.source, frames)
+        found = []
+        for window in self.windows:
+            first, last = np.searchsorted(frames, (window.start, window.stop))
+            n = float(count[first:last].sum())
+            found.append(float(total[first:last].sum()) / n if n else float("nan"))
+        return found
 
     @cached_property
     def structure(self) -> Any:
         """Structure factor and its first peak."""
         from cellquant.observables.structure import structure_factor
 
-        return structure_factor(
-            self.source,
-            diameter=self.diameter["mean_diameter"],
-            max_frames=self.settings.max_frames,
-        )
+        return structure_factor(self.layer, diameter=self.diameter["mean_diameter"])
 
     @cached_property
     def wave_number(self) -> dict[str, Any]:
@@ -230,15 +254,14 @@ class Context:
     def scattering(self, q: float, window: Window | None = None) -> "LagAverage":
         """F_s of the whole source, or of the pairs of points inside a window."""
         from cellquant.observables.dynamics import scattering_average
-        from cellquant.observables.trajectories import from_tracks, log_lags
+        from cellquant.observables.trajectories import log_lags
 
         paths, lags = self.paths, self.lags
         if window is not None and (window.start, window.stop) == self.frame_range:
             if q == self.wave_number["q"]:
                 return self.whole_scattering
         elif window is not None:
-            rows = self.smoothed_rows.inside(window)
-            paths = from_tracks(replace(self.smoothed, table=rows))
+            paths = paths.inside(window.start, window.stop)
             lags = log_lags(paths.max_lag)
         return scattering_average(
             paths, q, lags=lags, method=self.settings.scattering, stride=self.settings.stride
@@ -274,4 +297,4 @@ class Context:
         """Hexatic order and neighbour numbers."""
         from cellquant.observables.bonds import bond_order
 
-        return bond_order(self.source, max_frames=self.settings.max_frames)
+        return bond_order(self.layer)

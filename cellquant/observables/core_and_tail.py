@@ -1,6 +1,6 @@
 """Gaussian core and exponential tail of displacement lengths, by maximum likelihood."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 from scipy.special import erfcx
 
 from cellquant.observables.blocks import jackknife_error
-from cellquant.observables.smoothing import FloatArray, IntArray
+from cellquant.observables.trajectories import FloatArray, IntArray
 
 CORE_REACH = 1.5  # the core ends at this many standard deviations
 TAIL_EXCESS = 10.0  # the tail begins where it holds this many times what the core predicts
@@ -68,21 +68,51 @@ class Tail(NamedTuple):
 
 @dataclass(frozen=True)
 class _Lengths:
-    """Sorted lengths with their running sums, so that a range costs two searches."""
+    """Sorted lengths with their running sums, so that a range costs two searches.
+
+    Those of one block may be taken as absent: ``gone`` holds them, ``place`` where they stand.
+    """
 
     r: FloatArray
     first: FloatArray
     second: FloatArray
+    gone: "_Lengths | None" = None
+    place: IntArray | None = None
 
     @classmethod
     def of(cls, r: FloatArray) -> "_Lengths":
         return cls(r, np.r_[0.0, np.cumsum(r)], np.r_[0.0, np.cumsum(r * r)])
 
+    def without(self, place: IntArray) -> "_Lengths":
+        """The same without the lengths that stand at these places."""
+        return replace(self, gone=_Lengths.of(self.r[place]), place=place)
+
+    @property
+    def size(self) -> int:
+        return self.r.size - (self.gone.size if self.gone else 0)
+
+    def at(self, rank: int) -> float:
+        """The length with so many below it."""
+        if self.place is not None:
+            # So many of those that are left stand before each that is gone.
+            left_before = self.place - np.arange(self.place.size)
+            rank += int(np.searchsorted(left_before, rank, side="right"))
+        return float(self.r[rank])
+
+    def beyond(self, places: Any) -> Any:
+        """Number of lengths at or beyond each place."""
+        n = self.r.size - np.searchsorted(self.r, places)
+        return n - self.gone.beyond(places) if self.gone else n
+
     def between(self, low: float, high: float) -> tuple[int, float, float]:
         """Number of lengths in [low, high], their sum, and the sum of their squares."""
         a, b = np.searchsorted(self.r, low), np.searchsorted(self.r, high, side="right")
-        n = int(b - a)
-        return n, float(self.first[b] - self.first[a]), float(self.second[b] - self.second[a])
+        n, one = int(b - a), float(self.first[b] - self.first[a])
+        two = float(self.second[b] - self.second[a])
+        if self.gone:
+            less = self.gone.between(low, high)
+            return n - less[0], one - less[1], two - less[2]
+        return n, one, two
 
 
 def fit_core_and_tail(
@@ -129,12 +159,16 @@ def fit_core_and_tail(
         likewise.
     """
     order = np.argsort(r, kind="stable")
-    r, block = r[order], block[order]
-    core, tail = _fit(_Lengths.of(r), core_range, tail_range)
+    block = block[order]
+    lengths = _Lengths.of(r[order])
+    del order
+    core, tail = _fit(lengths, core_range, tail_range)
     present = np.flatnonzero(np.bincount(block, minlength=n_blocks))
     if present.size < 2:
         return core, float("nan"), tail, float("nan")
-    rest = [_fit(_Lengths.of(r[block != b]), core_range, tail_range) for b in present]
+    rest = [
+        _fit(lengths.without(np.flatnonzero(block == b)), core_range, tail_range) for b in present
+    ]
     errors = jackknife_error(np.array([[c.sigma2, t.xi] for c, t in rest]))
     return core, float(errors[0]), tail, float(errors[1])
 
@@ -150,7 +184,7 @@ def _fit_core(lengths: _Lengths, given: Range | None) -> Core:
     """A truncated Rayleigh law: r^2 is a truncated exponential."""
     low, high = given or (0.0, 0.0)
     if given is None:
-        high = CORE_REACH * float(lengths.r[lengths.r.size // 2]) / np.sqrt(2 * np.log(2))
+        high = CORE_REACH * lengths.at(lengths.size // 2) / np.sqrt(2 * np.log(2))
         for _ in range(3):
             n, _, squares = lengths.between(0.0, high)
             sigma2 = _truncated_scale(squares / max(n, 1), 0.0, high**2)
@@ -208,7 +242,7 @@ def _fit_tail(lengths: _Lengths, given: Range | None, core: Core) -> Tail:
 def _tail_start(lengths: _Lengths, core: Core) -> tuple[float, str]:
     """First r, in tenths of a standard deviation from two on, that the core does not explain."""
     places = core.component * (2 + 0.1 * np.arange(61))
-    beyond = lengths.r.size - np.searchsorted(lengths.r, places)
+    beyond = lengths.beyond(places)
     good = np.flatnonzero((beyond >= TAIL_EXCESS * core.beyond(places)) & (beyond >= MIN_COUNT))
     if good.size:
         return float(places[good[0]]), STANDS_OUT

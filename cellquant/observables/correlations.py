@@ -17,9 +17,8 @@ from cellquant.observables.blocks import (
 )
 from cellquant.observables.bonds import neighbour_pairs
 from cellquant.observables.dynamics import LagAverage
-from cellquant.observables.motion import steps
-from cellquant.observables.smoothing import FloatArray, IntArray
-from cellquant.observables.trajectories import Trajectories, log_lags
+from cellquant.observables.motion import displacements
+from cellquant.observables.trajectories import FloatArray, IntArray, Trajectories, log_lags
 
 
 def velocity_autocorrelation(paths: Trajectories, *, lags: IntArray | None = None) -> LagAverage:
@@ -40,22 +39,23 @@ def velocity_autocorrelation(paths: Trajectories, *, lags: IntArray | None = Non
         In squared length per squared time. Smoothing over n points correlates velocities less
         than n frames apart.
     """
-    dx, dy, _, entry = steps(paths)
     blocks = spatial_blocks(paths.centre, box=paths.box)
     if lags is None:
         lags = np.r_[0, log_lags(paths.max_lag - 1)]
-    size = paths.x.size
-    vx, vy, ok = np.zeros(size), np.zeros(size), np.zeros(size, dtype=bool)
-    vx[entry], vy[entry], ok[entry] = dx, dy, True
-    row = np.repeat(np.arange(paths.n_tracks), np.diff(paths.offsets))
     sums, counts = np.zeros((blocks.n, lags.size)), np.zeros((blocks.n, lags.size))
-    for m, lag in enumerate(lags.tolist()):
-        end = size - lag
-        both = np.flatnonzero(ok[:end] & ok[lag:] & (row[:end] == row[lag:]))
-        product = vx[both] * vx[both + lag] + vy[both] * vy[both + lag]
-        place = blocks.index[row[both]]
-        sums[:, m] = np.bincount(place, weights=product, minlength=blocks.n)
-        counts[:, m] = np.bincount(place, minlength=blocks.n)
+    for first, last in paths.spans():
+        entries, row = paths.rows_of(first, last)
+        dx, dy, _, entry = displacements(paths, 1, first=first, last=last)
+        vx, vy, ok = np.zeros(row.size), np.zeros(row.size), np.zeros(row.size, dtype=bool)
+        entry = entry - entries.start
+        vx[entry], vy[entry], ok[entry] = dx, dy, True
+        for m, lag in enumerate(lags.tolist()):
+            end = max(row.size - lag, 0)
+            both = np.flatnonzero(ok[:end] & ok[lag:] & (row[:end] == row[lag:]))
+            product = vx[both] * vx[both + lag] + vy[both] * vy[both + lag]
+            place = blocks.index[row[both]]
+            sums[:, m] += np.bincount(place, weights=product, minlength=blocks.n)
+            counts[:, m] += np.bincount(place, minlength=blocks.n)
     scale = paths.frame_interval
     return LagAverage(lags.astype(np.float64) * scale, sums / scale**2, counts, blocks.method)
 
@@ -165,7 +165,8 @@ class SpatialCorrelation:
     table
         distance, value, std_error, n_pairs.
     summary
-        correlation_length (1/e crossing) or None with a reason.
+        correlation_length (1/e crossing) with its error, or None with a reason and the distance
+        that it is above or below.
     """
 
     table: pd.DataFrame
@@ -235,23 +236,42 @@ def velocity_correlation(
             "n_pairs": np.rint(counts.sum(axis=0)).astype(np.int64),
         }
     )
-    return SpatialCorrelation(table, _correlation_length(table, moved=bool(square[:, 0].sum() > 0)))
+    summary = _correlation_length(table, rest, moved=bool(square[:, 0].sum() > 0))
+    return SpatialCorrelation(table, {**summary, "std_error_method": blocks.method})
 
 
-def _correlation_length(table: pd.DataFrame, *, moved: bool) -> dict[str, Any]:
-    known = table[table["n_pairs"] > 0]
-    none: dict[str, Any] = {"correlation_length": None}
-    if not moved or not len(known):
-        return {**none, "reason": "no cell moved" if len(known) else "no two cells in one frame"}
-    r, c = known["distance"].to_numpy(), known["value"].to_numpy()
-    low = np.flatnonzero(c < np.exp(-1))
+def _correlation_length(table: pd.DataFrame, rest: FloatArray, *, moved: bool) -> dict[str, Any]:
+    """Where the correlation falls to 1/e, with its error from the curves without each block."""
+    seen = table["n_pairs"].to_numpy() > 0
+    found: dict[str, Any] = {"correlation_length": None, "correlation_length_std_error": None}
+    if not moved or not seen.any():
+        return {**found, "reason": "no cell moved" if seen.any() else "no two cells in one frame"}
+    r, value = (table[name].to_numpy()[seen] for name in ("distance", "value"))
+    best = _falls_to(r, value, float(np.exp(-1)))
+    if np.isposinf(best):
+        reason = "the correlation stays above 1/e up to the largest distance (above)"
+        return {**found, "above": float(r[-1]), "reason": reason}
+    if np.isneginf(best):
+        reason = "the correlation is below 1/e at the smallest distance (below) already"
+        return {**found, "below": float(r[0]), "reason": reason}
+    found["correlation_length"] = best
+    replicates = np.array([_falls_to(r, curve[seen], float(np.exp(-1))) for curve in rest])
+    if len(replicates) < 2 or not np.isfinite(replicates).all():
+        return {**found, "reason": "without one of the blocks there is no crossing, so no error"}
+    found["correlation_length_std_error"] = float(jackknife_error(replicates))
+    return found
+
+
+def _falls_to(r: FloatArray, curve: FloatArray, level: float) -> float:
+    """First distance at which a curve falls to a level; infinite where it never or always does."""
+    low = np.flatnonzero(~(curve >= level))
     if not low.size:
-        return {**none, "reason": f"the correlation stays above 1/e up to {r[-1]:g}"}
+        return float("inf")
     k = int(low[0])
     if k == 0:
-        return {**none, "reason": f"the correlation is below 1/e at {r[0]:g} already"}
-    share = (c[k - 1] - np.exp(-1)) / (c[k - 1] - c[k])
-    return {"correlation_length": float(r[k - 1] + share * (r[k] - r[k - 1]))}
+        return float("-inf")
+    share = (curve[k - 1] - level) / (curve[k - 1] - curve[k])
+    return float(r[k - 1] + share * (r[k] - r[k - 1]))
 
 
 def cage_relative(

@@ -15,8 +15,8 @@ from cellquant.observables.blocks import (
     spatial_blocks,
     sum_by_block,
 )
-from cellquant.observables.smoothing import FloatArray, IntArray
-from cellquant.observables.trajectories import Trajectories, from_tracks, log_lags
+from cellquant.observables.smoothing import from_tracks
+from cellquant.observables.trajectories import FloatArray, IntArray, Trajectories, log_lags
 from cellquant.tables import Tracks
 
 ScatteringMethod = Literal["bessel", "vectors"]

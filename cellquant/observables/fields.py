@@ -19,30 +19,19 @@ def _blank(*names: str, counts: str = "n_pairs") -> pd.DataFrame:
 
 def structure_factor(context: Context, out: Results) -> None:
     out.summary["wave_number"] = dict(context.wave_number)
-    out.summary["structure_factor"] = dict(context.structure.peak)
+    out.summary["structure_factor"] = {
+        **context.structure.peak,
+        "n_frames": int(context.layer.frames.size),
+    }
     out.tables["structure_factor"] = context.structure.table
 
 
 def pair_correlation(context: Context, out: Results) -> None:
     from cellquant.observables.structure import pair_correlation as measure
 
-    table = measure(
-        context.source,
-        diameter=context.diameter["mean_diameter"],
-        max_frames=context.settings.max_frames,
-    )
-    out.tables["pair_correlation"] = table
-    excess = table["value"] - 1 - 3 * table["std_error"].fillna(np.inf)
-    if (excess > 0).any():
-        k = int(np.nanargmax(table["value"].where(excess > 0).to_numpy()))
-        out.summary["pair_correlation"] = {
-            "peak_distance": table["distance"].iloc[k],
-            "peak_height": table["value"].iloc[k],
-            "peak_height_std_error": table["std_error"].iloc[k],
-        }
-    else:
-        reason = "g(r) nowhere exceeds 1 by three standard errors"
-        out.summary["pair_correlation"] = {"peak_distance": None, "reason": reason}
+    found = measure(context.layer, diameter=context.diameter["mean_diameter"])
+    out.tables["pair_correlation"] = found.table
+    out.summary["pair_correlation"] = {**found.peak, "n_frames": int(context.layer.frames.size)}
 
 
 def hexatic_order(context: Context, out: Results) -> None:
@@ -66,7 +55,7 @@ def van_hove(context: Context, out: Results) -> None:
         "component_variance_std_error": None, "xi": None, "xi_std_error": None,
         "core_form": CORE_FORM, "tail_form": TAIL_FORM,
         "normalisation": NORMALISATIONS, "core_range": None, "tail_range": None,
-        "length_unit": "mean diameter" if d else context.source.units.length,
+        "length_unit": "mean diameter" if d else context.head.units.length,
         "length_in_table_unit": d or 1.0,
     }  # fmt: skip
     if lag_time is None:
@@ -122,7 +111,7 @@ def velocity_autocorrelation(context: Context, out: Results) -> None:
         out.tables["velocity_autocorrelation"] = _blank("lag_time", "value", "std_error")
         return
     found = measure(context.paths)
-    first = max(context.smoothed.smoothing, 1)
+    first = max(context.smoothed_over, 1)
     out.summary["velocity_autocorrelation"] = persistence_time(
         found, first_lag=first, interval=context.tracks.frame_interval
     )
@@ -135,7 +124,7 @@ def velocity_correlation(context: Context, out: Results) -> None:
     d = context.diameter["mean_diameter"]
     reason = context.no_motion
     if reason is None and d is None:
-        density = context.source.table.groupby("frame").size().mean() / context.tracks.area
+        density = context.census.n_cells.mean() / context.tracks.area
         d = float(density**-0.5)
     if reason is not None or d is None:
         out.summary["velocity_correlation"] = {"correlation_length": None, "reason": reason}

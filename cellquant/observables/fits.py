@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from cellquant.observables.blocks import jackknife_error, leave_one_out, ratio_with_error
 from cellquant.observables.dynamics import LagAverage
-from cellquant.observables.smoothing import FloatArray
+from cellquant.observables.trajectories import FloatArray
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import numpy as np
 from numba import njit, prange
 from scipy.special import factorial, jv
 
-from cellquant.observables.smoothing import FloatArray, IntArray
-from cellquant.observables.trajectories import BoolArray, Trajectories
+from cellquant.observables.trajectories import BoolArray, FloatArray, IntArray, Trajectories
 
 _FAST = {"contract", "reassoc", "nsz"}
 

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cellquant.observables.blocks import Blocks
 from cellquant.observables.context import Context
-from cellquant.observables.shape import BORDER_RULE, cell_blocks, describe
-from cellquant.observables.windows import DENSITY_RULE, density_per_frame, mean_of_series
+from cellquant.observables.shape import BORDER_RULE, describe, pooled
+from cellquant.observables.windows import DENSITY_RULE, mean_of_series
+from cellquant.rows import Piece
 
 
 @dataclass
@@ -29,11 +31,11 @@ def _lag_columns() -> pd.DataFrame:
 
 
 def density(context: Context, out: Results) -> None:
-    frames = density_per_frame(context.source)
+    frames = context.per_frame
     mean, error, method = mean_of_series(
         frames["density"].to_numpy(), min(context.window_points, 24)
     )
-    unit = context.source.units.length
+    unit = context.head.units.length
     out.summary["density"] = {
         "mean": mean,
         "std_error": error,
@@ -50,12 +52,15 @@ def density(context: Context, out: Results) -> None:
 
 
 def _distribution(context: Context, out: Results, name: str) -> None:
-    rows = context.contours
-    values = rows[name].to_numpy(dtype=np.float64)
-    known = np.isfinite(values)
-    found = describe(values[known], cell_blocks(rows[known], context.box))
+    def of_piece(piece: Piece) -> Any:
+        used = ~piece["touches_border"] & np.isfinite(piece["shape_index"])
+        used &= np.isfinite(piece[name])
+        return used, piece[name][used]
+
+    columns = ("shape_index", name, "touches_border")
+    found = describe(*pooled(context.source, columns, of_piece))
     out.summary[name] = {**found.summary, "border_rule": BORDER_RULE}
-    if not known.any():
+    if not found.summary["n"]:
         out.summary[name]["reason"] = "no cell away from the border has a measured contour"
     out.tables[name] = found.table.rename(columns={"value": name, "density": "value"})
 
@@ -76,7 +81,7 @@ def speed(context: Context, out: Results) -> None:
     from cellquant.observables.motion import speeds
 
     if context.no_motion:
-        found = describe(np.empty(0), cell_blocks(context.source.table[:0], None))
+        found = describe(np.empty(0), Blocks(np.empty(0, dtype=np.int64), 0, "none"))
         out.summary["speed"] = {**found.summary, "reason": context.no_motion}
     else:
         values, blocks = speeds(context.paths)

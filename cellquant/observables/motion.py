@@ -6,27 +6,46 @@ import numpy as np
 
 from cellquant.observables.blocks import Blocks, jackknife_error, leave_one_out, spatial_blocks
 from cellquant.observables.dynamics import LagAverage
-from cellquant.observables.smoothing import FloatArray, IntArray
-from cellquant.observables.trajectories import Trajectories
+from cellquant.observables.trajectories import FloatArray, IntArray, Trajectories
 
 
-def steps(paths: Trajectories) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
-    """Displacements between consecutive frames.
+def displacements(
+    paths: Trajectories, lag: int, *, first: int = 0, last: int | None = None
+) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """All displacements over a lag, of all tracks or of a range of them.
+
+    Parameters
+    ----------
+    paths
+        Trajectories.
+    lag
+        Lag in frames, >= 1.
+    first, last
+        Half-open range of tracks.
 
     Returns
     -------
     dx, dy : numpy.ndarray
-        (n,) components.
+        (n,) components in length units.
     track : numpy.ndarray
         (n,) index of the track.
     entry : numpy.ndarray
         (n,) index of the earlier point in the arrays of `paths`.
     """
-    row = np.repeat(np.arange(paths.n_tracks), np.diff(paths.offsets))
-    both = paths.valid[:-1] & paths.valid[1:] & (row[1:] == row[:-1])
-    entry = np.flatnonzero(both)
-    dx, dy = paths.x[entry + 1] - paths.x[entry], paths.y[entry + 1] - paths.y[entry]
-    return dx, dy, row[entry], entry
+    entries, row = paths.rows_of(first, paths.n_tracks if last is None else last)
+    x, y, valid = paths.x[entries], paths.y[entries], paths.valid[entries]
+    i = np.flatnonzero(valid[:-lag] & valid[lag:] & (row[lag:] == row[:-lag]))
+    return x[i + lag] - x[i], y[i + lag] - y[i], row[i], i + entries.start
+
+
+def lengths(paths: Trajectories, lag: int, blocks: Blocks) -> tuple[FloatArray, IntArray]:
+    """Lengths of all displacements over a lag, and the block of each, range of tracks by range."""
+    found, block = [np.empty(0)], [np.empty(0, dtype=np.int16)]
+    for first, last in paths.spans():
+        dx, dy, track, _ = displacements(paths, lag, first=first, last=last)
+        found.append(np.hypot(dx, dy))
+        block.append(blocks.index[track].astype(np.int16))
+    return np.concatenate(found), np.concatenate(block)
 
 
 def speeds(paths: Trajectories) -> tuple[FloatArray, Blocks]:
@@ -39,10 +58,10 @@ def speeds(paths: Trajectories) -> tuple[FloatArray, Blocks]:
     blocks : Blocks
         Replicate block of each, the tracks grouped in space.
     """
-    dx, dy, track, _ = steps(paths)
     blocks = spatial_blocks(paths.centre, box=paths.box)
-    values = np.hypot(dx, dy) / paths.frame_interval
-    return values, Blocks(blocks.index[track], blocks.n, blocks.method)
+    values, block = lengths(paths, 1, blocks)
+    values /= paths.frame_interval
+    return values, Blocks(block, blocks.n, blocks.method)
 
 
 def growth_exponent(second: LagAverage) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from cellquant.observables import fields, measures, relaxations
 from cellquant.observables.context import Context
 from cellquant.observables.measures import Measure, Results
 from cellquant.observables.settings import checked_settings
+from cellquant.rows import Scan
 from cellquant.storage import atomic_path, write_json
 from cellquant.tables import CELL_COLUMNS, TRACK_COLUMNS, Cells, Tracks, Units, write_table
 
@@ -158,8 +159,9 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
     Parameters
     ----------
     source
-        `Tracks`; anything with a ``to_tracks(columns=...)`` method, such as a run; or `Cells`,
-        from which only what needs no trajectories is measured.
+        `Tracks`; anything with a ``to_tracks(columns=...)`` method, such as a run; or `Cells`, from
+        which only what needs no trajectories is measured. Tracks and cells may stay on disk
+        (`cellquant.rows.scan_tracks`, `scan_cells`): they are read in pieces and never held whole.
     only
         Names out of `available_observables`; all that the source allows when None.
     smoothing
@@ -207,14 +209,14 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
     """
     if isinstance(only, str):
         raise InputError(f"only must be a list of names, got {only!r}; write only=[{only!r}].")
-    if not isinstance(source, (Tracks, Cells)):
+    if not isinstance(source, (Tracks, Cells, Scan)):
         if not hasattr(source, "to_tracks"):
             raise InputError(
                 f"observables are measured from tracks, cells or a run, got "
                 f"{type(source).__name__}; open the source first."
             )
         source = source.to_tracks(columns=columns_read(only))
-    wanted = _wanted(source, only)
+    wanted = _wanted(source.head if isinstance(source, Scan) else source, only)
     settings = checked_settings(options)
     context = Context(source, settings, wanted)
     out = Results(_head(context))
@@ -222,7 +224,8 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
         _CATALOGUE[name].measure(context, out)
     if needs_tracks(wanted):
         out.summary["processing"] = _processing(context)
-    stationarity = source.provenance.get("stationarity") if isinstance(source, Tracks) else None
+    head = context.head
+    stationarity = head.provenance.get("stationarity") if isinstance(head, Tracks) else None
     if stationarity is not None and "shape_index" in out.summary:
         out.summary["stationarity"] = stationarity
     summary: dict[str, Any] = _plain(out.summary)
@@ -230,8 +233,10 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
     if "relaxation_times" in out.tables:
         from cellquant.statistics import study_statistics
 
-        statistics = study_statistics(out.tables["relaxation_times"])
-    return Observables(summary, out.tables, source.units, statistics)
+        statistics = study_statistics(
+            out.tables["relaxation_times"], why_empty=out.summary.get("windows_reason")
+        )
+    return Observables(summary, out.tables, head.units, statistics)
 
 
 def _wanted(source: Tracks | Cells, only: Sequence[str] | None) -> list[str]:
@@ -250,31 +255,28 @@ def _wanted(source: Tracks | Cells, only: Sequence[str] | None) -> list[str]:
 
 
 def _head(context: Context) -> dict[str, Any]:
-    source, n_frames = context.source, context.n_frames
+    head, n_frames, census = context.head, context.n_frames, context.census
     return {
         "n_frames": n_frames,
-        "n_cells_mean": len(source.table) / n_frames if n_frames else None,
-        "n_tracks": source.n_tracks if isinstance(source, Tracks) else None,
-        "length_unit": source.units.length,
-        "time_unit": source.units.time,
+        "n_cells_mean": census.n_rows / n_frames if n_frames else None,
+        "n_tracks": census.n_tracks if isinstance(head, Tracks) else None,
+        "length_unit": head.units.length,
+        "time_unit": head.units.time,
     }
 
 
 def _processing(context: Context) -> dict[str, Any]:
-    tracks = context.tracks
-    drift = context.unsmoothed.provenance.get("drift") if context.settings.drift else None
+    drift = context.survey.drift
     return {
-        "smoothing_points": max(context.smoothing, tracks.smoothing)
-        if tracks.smoothing == 1
-        else tracks.smoothing,
+        "smoothing_points": context.smoothed_over,
         "smoothing_rule": "given"
         if context.settings.smoothing is not None
         else "5 in an open field of view, 1 in a periodic box",
         "drift_removed": bool(drift and drift["removed"]),
         "drift": drift,
-        "cut_cells_left_out": context.unsmoothed.provenance.get("cut_cells_left_out", 0),
+        "cut_cells_left_out": context.survey.n_cut,
         "min_points": context.settings.min_points,
-        "n_tracks_retained": context.unsmoothed.n_tracks,
+        "n_tracks_retained": int(context.survey.kept.sum()),
         "window_points": context.window_points,
         "time_origin_stride": context.settings.stride,
     }

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cellquant.observables.dynamics import LagAverage
-from cellquant.observables.smoothing import FloatArray
+from cellquant.observables.trajectories import FloatArray
 
 THRESHOLD = float(np.exp(-1.0))
 
@@ -126,9 +126,9 @@ def relaxation_time(
     if np.isinf(tau):
         never = tau > 0
         reason = (
-            f"F_s stays above {threshold:.4g} up to the longest lag, {last:g}"
+            f"F_s stays above {threshold:.4g} up to the longest lag (censored_at)"
             if never
-            else f"F_s is below {threshold:.4g} at the shortest lag, {first:g}, already"
+            else f"F_s is below {threshold:.4g} at the shortest lag (below) already"
         )
         low = _quantile(resamples, 0.025) if never else None
         high = None if never else first

@@ -7,13 +7,7 @@ import pandas as pd
 
 from cellquant.observables.context import Context
 from cellquant.observables.measures import Results
-from cellquant.observables.windows import (
-    Window,
-    bin_density,
-    density_per_frame,
-    density_scale,
-    mean_diameter,
-)
+from cellquant.observables.windows import bin_density, density_scale
 
 _SCATTERING_COLUMNS = (
     "lag_time", "value", "std_error", "n_pairs", "scope", "window", "bin_centre", "q",
@@ -100,14 +94,14 @@ def windows(context: Context, out: Results) -> None:
     from cellquant.observables.dynamics import LagAverage, pool
     from cellquant.observables.relaxation import relaxation_time
 
-    scale = density_scale(context.source.units)
-    factor, unit = scale or (1.0, f"1/{context.source.units.length}^2")
-    per_frame = density_per_frame(context.source)
+    scale = density_scale(context.head.units)
+    factor, unit = scale or (1.0, f"1/{context.head.units.length}^2")
+    per_frame = context.per_frame
     curves: list[pd.DataFrame] = []
     entries: list[dict[str, Any]] = []
     binned: dict[float, list[tuple[dict[str, Any], LagAverage]]] = {}
     for number, window in enumerate(context.windows):
-        entry = _window_entry(context, window, per_frame, factor)
+        entry = _window_entry(context, number, per_frame, factor)
         entry.update(number=number, density_unit=unit, bin_centre=None)
         if scale is None:
             entry["bin_reason"] = "density bins are in cells/mm^2 and need lengths in um"
@@ -137,6 +131,8 @@ def windows(context: Context, out: Results) -> None:
                 binned.setdefault(key, []).append((entry, average))
         entries.append(entry)
     out.summary["windows"] = entries
+    if not binned:
+        out.summary["windows_reason"] = _why_no_window(context, entries)
     out.tables["windows"] = _windows_table(entries)
     rows = []
     for centre in sorted(binned):
@@ -155,12 +151,31 @@ def windows(context: Context, out: Results) -> None:
             out.tables["self_intermediate_scattering"] = pd.concat(parts, ignore_index=True)
 
 
+def _why_no_window(context: Context, entries: list[dict[str, Any]]) -> str:
+    """Why no window gives a relaxation time in a density bin."""
+    if not entries:
+        return (
+            f"the movie has {context.n_frames} frames, fewer than the {context.window_points} of "
+            "a window"
+        )
+    reasons = list(dict.fromkeys(e["reason"] for e in entries if e.get("reason")))
+    if reasons:
+        return "; ".join(reasons)
+    low, high = (f(e["density"] for e in entries) for f in (min, max))
+    width, centres = context.settings.bin_width, context.settings.bin_centres
+    return (
+        f"the windows have densities of {low:.4g} to {high:.4g} {entries[0]['density_unit']}, all "
+        f"outside the bins from {min(centres) - width / 2:g} to {max(centres) + width / 2:g}"
+    )
+
+
 def _window_entry(
-    context: Context, window: Window, per_frame: pd.DataFrame, factor: float
+    context: Context, number: int, per_frame: pd.DataFrame, factor: float
 ) -> dict[str, Any]:
+    window = context.windows[number]
     inside = per_frame["frame"].between(window.start, window.stop - 1)
     dt = context.tracks.frame_interval
-    d, _ = mean_diameter(context.source_rows.inside(window))
+    d = context.window_diameters[number]
     entry: dict[str, Any] = {
         "start": window.start * dt,
         "stop": window.stop * dt,

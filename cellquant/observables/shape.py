@@ -1,5 +1,6 @@
 """Distribution of the shape of cells, pooled over frames."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,7 +8,9 @@ import numpy as np
 import pandas as pd
 
 from cellquant.observables.blocks import Blocks, jackknife_error, spatial_blocks
-from cellquant.observables.smoothing import FloatArray
+from cellquant.observables.trajectories import FloatArray, IntArray
+from cellquant.rows import Piece, Scan, rows_of
+from cellquant.tables import Cells, Tracks
 
 MODE_RESAMPLINGS = 200
 BORDER_RULE = "cells that touch the border of the image are left out"
@@ -30,7 +33,9 @@ class Distribution:
     table: pd.DataFrame
 
 
-def cell_blocks(table: pd.DataFrame, box: tuple[float, float] | None) -> Blocks:
+def cell_blocks(
+    place: FloatArray, track: IntArray | None, box: tuple[float, float] | None
+) -> Blocks:
     """Replicate blocks of the rows of a table of cells.
 
     Rows of one track share a block, found from the track's mean position; without tracks, rows
@@ -38,8 +43,10 @@ def cell_blocks(table: pd.DataFrame, box: tuple[float, float] | None) -> Blocks:
 
     Parameters
     ----------
-    table
-        Columns x and y, perhaps track_id.
+    place
+        (n, 2) positions.
+    track
+        (n,) track of each row; None where there are none.
     box
         Edges of a periodic box, or None.
 
@@ -47,11 +54,10 @@ def cell_blocks(table: pd.DataFrame, box: tuple[float, float] | None) -> Blocks:
     -------
     Blocks
     """
-    place = table[["x", "y"]].to_numpy(dtype=np.float64)
-    if "track_id" not in table.columns:
+    if track is None:
         blocks = spatial_blocks(np.nan_to_num(place), box=box)
         return Blocks(blocks.index, blocks.n, blocks.method.replace("tracks", "cells"))
-    _, row = np.unique(table["track_id"].to_numpy(), return_inverse=True)
+    _, row = np.unique(track, return_inverse=True)
     n = int(row.max()) + 1 if row.size else 0
     known = np.isfinite(place).all(axis=1)
     size = np.maximum(np.bincount(row[known], minlength=n), 1)
@@ -60,6 +66,50 @@ def cell_blocks(table: pd.DataFrame, box: tuple[float, float] | None) -> Blocks:
     )
     blocks = spatial_blocks(centre, box=box)
     return Blocks(blocks.index[row], blocks.n, blocks.method)
+
+
+def pooled(
+    source: Tracks | Cells | Scan,
+    columns: tuple[str, ...],
+    value: Callable[[Piece], tuple[Any, FloatArray]],
+) -> tuple[FloatArray, Blocks]:
+    """Values of a part of the rows of a table, with their replicate blocks (`cell_blocks`).
+
+    Parameters
+    ----------
+    source
+        Cells, or tracks.
+    columns
+        What `value` reads.
+    value
+        Gives, for a piece, which rows are used and their values.
+    """
+    rows, head = rows_of(source), source.head if isinstance(source, Scan) else source
+    box = head.box if isinstance(head, Tracks) else None
+    names = tuple(dict.fromkeys((*columns, "x", "y")))
+    values, centres, items = [np.empty(0)], [np.empty((0, 2))], [np.empty(0, dtype=np.int32)]
+    n_items = 0
+    for piece in rows.pieces(*names):
+        used, found = value(piece)
+        place = np.column_stack([piece["x"][used], piece["y"][used]])
+        values.append(found)
+        if not rows.linked:
+            centres.append(place)
+            continue
+        track, row = np.unique(piece["track_id"][used], return_inverse=True)
+        known = np.isfinite(place).all(axis=1)
+        size = np.maximum(np.bincount(row[known], minlength=track.size), 1)
+        sums = [np.bincount(row[known], weights=v, minlength=track.size) for v in place[known].T]
+        centres.append(np.column_stack(sums) / size[:, None])
+        items.append((n_items + row).astype(np.int32))
+        n_items += track.size
+    centre = np.concatenate(centres)
+    blocks = spatial_blocks(np.nan_to_num(centre), box=box)
+    if not rows.linked:
+        method = blocks.method.replace("tracks", "cells")
+        return np.concatenate(values), Blocks(blocks.index, blocks.n, method)
+    index = blocks.index.astype(np.int16)[np.concatenate(items)]
+    return np.concatenate(values), Blocks(index, blocks.n, blocks.method)
 
 
 def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distribution:
@@ -94,8 +144,10 @@ def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distri
     if values.size == 0:
         return Distribution({**dict.fromkeys(_DESCRIPTORS), "std_error": None, "n": 0}, _empty())
     order = np.argsort(blocks.index, kind="stable")
-    parts = np.split(values[order], np.cumsum(np.bincount(blocks.index, minlength=blocks.n))[:-1])
+    sizes = np.bincount(blocks.index, minlength=blocks.n)
+    parts = np.split(values[order], np.cumsum(sizes)[:-1])
     parts = [part for part in parts if part.size]
+    del order
     bandwidth = _bandwidth(values)
     grid, counts = _fine_counts(parts, bandwidth)
     smooth = _smooth(counts.sum(axis=0), grid, bandwidth)
@@ -104,7 +156,7 @@ def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distri
     whole = _descriptors(powers.sum(axis=0), centre, float(np.median(values)), _peak(grid, smooth))
     summary: dict[str, Any] = dict(whole)
     if len(parts) >= 2:
-        medians = _medians_without(parts)
+        medians = _medians_without(values, blocks.index)
         rest = [
             _descriptors(
                 powers.sum(axis=0) - powers[b],
@@ -170,22 +222,19 @@ def _descriptors(powers: FloatArray, centre: float, median: float, mode: float) 
     }
 
 
-def _medians_without(parts: list[FloatArray]) -> list[float]:
-    """Median of all values without each part, from one common sort."""
-    values = np.concatenate(parts)
-    part = np.repeat(np.arange(len(parts)), [p.size for p in parts])
+def _medians_without(values: FloatArray, block: IntArray) -> list[float]:
+    """Median of all values without each block that has any, from one common sort."""
     order = np.argsort(values, kind="stable")
-    values, part = values[order], part[order]
+    values, block = values[order], block[order]
+    del order
     medians = []
-    for b, left_out in enumerate(parts):
-        kept = np.flatnonzero(part != b)
-        half = (values.size - left_out.size) // 2
-        odd = (values.size - left_out.size) % 2 == 1
-        medians.append(
-            float(
-                values[kept[half]] if odd else 0.5 * (values[kept[half - 1]] + values[kept[half]])
-            )
-        )
+    for left_out in np.unique(block):
+        gone = np.flatnonzero(block == left_out)
+        kept_before = gone - np.arange(gone.size)  # values kept that are smaller
+        size = values.size - gone.size
+        ranks = np.array([(size - 1) // 2, size // 2])
+        places = ranks + np.searchsorted(kept_before, ranks, side="right")
+        medians.append(0.5 * float(values[places[0]] + values[places[1]]))
     return medians
 
 

@@ -1,116 +1,234 @@
 """What is done to trajectories before they are measured: cut cells, drift, retention, smoothing."""
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from cellquant.errors import InputError
+from cellquant.observables.trajectories import FloatArray, IntArray, Layout, Trajectories
+from cellquant.rows import Rows, Scan, rows_of
 from cellquant.tables import Tracks
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 # With n cells the drift estimate carries 1/n of every cell's own motion; below this many cells
 # common to two frames it would be motion, not drift, that is taken away.
 MIN_DRIFT_CELLS = 8
 
 
-def ordered_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows sorted by track and frame, after checking that no pair occurs twice.
+@dataclass(frozen=True)
+class Survey:
+    """What two readings of a table of tracks find, without holding it.
+
+    Attributes
+    ----------
+    n_cut
+        Rows left out because the border of the image cuts the cell.
+    n_tracks
+        Tracks with a position among the others.
+    longest_run
+        Longest run of consecutive frames with a position.
+    kept
+        (n_tracks,) which tracks are retained.
+    first, last
+        (n_tracks,) first and last frame with a position.
+    present
+        Frames with a position; empty where drift is not removed.
+    shift
+        (2, n_present) how far the population has moved since the first of them.
+    drift
+        What was done about drift; None where it was not to be removed.
+    """
+
+    n_cut: int
+    n_tracks: int
+    longest_run: int
+    kept: Any
+    first: IntArray
+    last: IntArray
+    present: IntArray
+    shift: FloatArray
+    drift: dict[str, Any] | None
+
+
+def survey(
+    source: Tracks | Scan,
+    *,
+    keep_cut_cells: bool = True,
+    drift: bool = False,
+    min_points: int = 1,
+) -> Survey:
+    """Find the drift of the population and the tracks to retain.
 
     Parameters
     ----------
-    table
-        Columns track_id and frame at least.
+    source
+        Trajectories, in memory or on disk.
+    keep_cut_cells
+        Whether positions of cells that the border of the image cuts count. The centroid of what
+        is seen of a cut cell moves at about half the speed of the cell across the border, so that
+        such positions make motion look slower than it is. Without them a track that touches the
+        border for a while has a gap there.
+    drift
+        Whether the motion of the centre of mass of the population is to be removed:
+        ``R(t) = sum_{s <= t} mean_i [r_i(s) - r_i(s - 1)]``, the mean over the cells present in
+        both frames, is subtracted from every position. Summing steps of the same cells, instead
+        of averaging positions, keeps a cell that enters or leaves from moving the centre of mass.
+    min_points
+        A track stays, whole, when its longest run of consecutive frames with a position has at
+        least this many points, >= 1.
 
     Returns
     -------
-    pandas.DataFrame
-        The same rows with a fresh index.
+    Survey
+        The step between two successive frames is undefined when fewer than 8 cells are common to
+        both: it is taken as zero, and counted in ``drift["steps_kept"]``. The mean-square
+        displacement of n independent cells comes out low by a factor ``1 - 1/n``.
+
+    Raises
+    ------
+    ValueError
+        If min_points is below 1.
+    InputError
+        If a track has two rows in one frame.
+    """
+    if min_points < 1:
+        raise ValueError(f"min_points must be >= 1, got {min_points}")
+    rows = rows_of(source)
+    present = np.empty(0, dtype=np.int64)
+    if drift:
+        for _, frame, *_ in _positions(rows, keep_cut_cells):
+            present = np.union1d(present, frame)
+    total, count = np.zeros((2, present.size)), np.zeros(present.size, dtype=np.int64)
+    first, last, longest = [], [], []
+    n_cut = 0
+    for track, frame, place, cut in _positions(rows, keep_cut_cells):
+        n_cut += cut
+        if not track.size:
+            continue
+        new = _changes(track)
+        starts = np.flatnonzero(new)
+        first.append(frame[starts])
+        last.append(frame[np.r_[starts[1:], track.size] - 1])
+        run = np.flatnonzero(new | np.r_[True, np.diff(frame) != 1])
+        length = np.diff(np.r_[run, track.size])
+        longest.append(np.maximum.reduceat(length, np.searchsorted(run, starts)))
+        if drift:
+            index = np.searchsorted(present, frame)
+            same = np.flatnonzero((track[1:] == track[:-1]) & (np.diff(index) == 1))
+            np.add.at(count, index[same + 1], 1)
+            for axis in (0, 1):
+                step = place[axis][same + 1] - place[axis][same]
+                np.add.at(total[axis], index[same + 1], step)
+    trusted = count >= MIN_DRIFT_CELLS
+    shift = np.cumsum(np.where(trusted, total / np.maximum(count, 1), 0.0), axis=1)
+    steps_kept = int(np.sum(~trusted[1:]))
+    run_length = _joined(longest)
+    return Survey(
+        n_cut=n_cut,
+        n_tracks=run_length.size,
+        longest_run=int(run_length.max(initial=0)),
+        kept=run_length >= min_points,
+        first=_joined(first),
+        last=_joined(last),
+        present=present,
+        shift=shift,
+        drift={
+            "removed": steps_kept < present.size - 1,
+            "steps_kept": steps_kept,
+            "min_cells": MIN_DRIFT_CELLS,
+        }
+        if drift
+        else None,
+    )
+
+
+def _changes(track: IntArray) -> Any:
+    """Which rows are the first of their track."""
+    new = np.ones(track.size, dtype=bool)
+    new[1:] = track[1:] != track[:-1]
+    return new
+
+
+def _joined(parts: list[IntArray]) -> IntArray:
+    return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
+
+
+def _positions(
+    rows: Rows, keep_cut_cells: bool
+) -> Iterator[tuple[IntArray, IntArray, tuple[FloatArray, FloatArray], int]]:
+    """Track, frame and place of the rows with a position that counts, and how many were cut."""
+    for piece in rows.pieces("track_id", "frame", "x", "y", "touches_border"):
+        track, frame, x, y = (piece[name] for name in ("track_id", "frame", "x", "y"))
+        twice = (track[1:] == track[:-1]) & (frame[1:] == frame[:-1])
+        if twice.any():
+            row = int(np.flatnonzero(twice)[0])
+            again = int(np.sum((track == track[row]) & (frame == frame[row])))
+            raise InputError(
+                f"track {track[row]} has {again} rows in frame {frame[row]}, but a cell has one "
+                "position at a time; remove the duplicates or track the masks again."
+            )
+        counts = np.isfinite(x) & np.isfinite(y)
+        cut = 0
+        if not keep_cut_cells:
+            counts &= ~piece["touches_border"]
+            cut = int(piece["touches_border"].sum())
+        yield track[counts], frame[counts], (x[counts], y[counts]), cut
+
+
+def trajectories_of(
+    source: Tracks | Scan, found: Survey, *, keep_cut_cells: bool = True
+) -> Trajectories:
+    """The retained tracks as arrays, relative to the centre of mass where drift is removed.
+
+    Parameters
+    ----------
+    source
+        The tracks that were surveyed.
+    found
+        What the survey found.
+    keep_cut_cells
+        As in the survey.
+    """
+    head = source.head if isinstance(source, Scan) else source
+    assert isinstance(head, Tracks)
+    kept = found.kept
+    number = np.cumsum(kept) - 1
+    layout = Layout(found.first[kept], found.last[kept])
+    before = 0
+    for track, frame, (x, y), _ in _positions(rows_of(source), keep_cut_cells):
+        new = _changes(track)
+        index = before + np.cumsum(new) - 1
+        before += int(new.sum())
+        used = kept[index]
+        index, frame, x, y = number[index[used]], frame[used], x[used], y[used]
+        if found.present.size:
+            moved = found.shift[:, np.searchsorted(found.present, frame)]
+            x, y = x - moved[0], y - moved[1]
+        layout.add(index, frame, x, y)
+    return layout.trajectories(frame_interval=head.frame_interval, box=head.box)
+
+
+def from_tracks(source: Tracks | Scan, **options: Any) -> Trajectories:
+    """Lay tracks out as arrays; rows without a finite position count as missing frames.
+
+    Parameters
+    ----------
+    source
+        Trajectories, in memory or on disk.
+    options
+        Those of `survey`: without any, the tracks as they are.
 
     Raises
     ------
     InputError
         If a track has two rows in one frame.
     """
-    track, frame = table["track_id"].to_numpy(), table["frame"].to_numpy()
-    order = np.lexsort((frame, track))
-    if not np.array_equal(order, np.arange(order.size)):
-        table = table.iloc[order]
-        track, frame = track[order], frame[order]
-    twice = (track[1:] == track[:-1]) & (frame[1:] == frame[:-1])
-    if twice.any():
-        row = int(np.flatnonzero(twice)[0])
-        raise InputError(
-            f"track {track[row]} has {int(np.sum((track == track[row]) & (frame == frame[row])))} "
-            f"rows in frame {frame[row]}, but a cell has one position at a time; remove the "
-            "duplicates or track the masks again."
-        )
-    return table.reset_index(drop=True)
+    keep = bool(options.get("keep_cut_cells", True))
+    return trajectories_of(source, survey(source, **options), keep_cut_cells=keep)
 
 
-def _segments(track: IntArray, frame: IntArray, finite: Any) -> tuple[IntArray, IntArray]:
-    """Position of each row in its run of consecutive frames, and the length of that run.
-
-    Rows without a finite position belong to no run and get length 0.
-    """
-    n = track.size
-    start = np.ones(n, dtype=bool)
-    start[1:] = (
-        (track[1:] != track[:-1])
-        | (frame[1:] != frame[:-1] + 1)
-        | (finite[1:] != finite[:-1])
-        | ~finite[1:]
-    )
-    run = np.cumsum(start) - 1
-    first = np.flatnonzero(start)
-    position = np.arange(n) - first[run]
-    length = np.bincount(run, minlength=first.size)[run] if n else np.zeros(0, dtype=np.int64)
-    return position.astype(np.int64), np.where(finite, length, 0).astype(np.int64)
-
-
-def _arrays(table: pd.DataFrame) -> tuple[IntArray, IntArray, FloatArray, FloatArray, Any]:
-    x = table["x"].to_numpy(dtype=np.float64, copy=True)
-    y = table["y"].to_numpy(dtype=np.float64, copy=True)
-    finite = np.isfinite(x) & np.isfinite(y)
-    return (
-        table["track_id"].to_numpy(dtype=np.int64),
-        table["frame"].to_numpy(dtype=np.int64),
-        x,
-        y,
-        finite,
-    )
-
-
-def leave_out_cut_cells(tracks: Tracks) -> Tracks:
-    """Leave out the positions of cells that the border of the image cuts.
-
-    The centroid of the visible part of a cut cell moves at about half the speed of the cell
-    across the border, so that such positions make motion look slower than it is. A track that
-    touches the border for a while has a gap there.
-
-    Parameters
-    ----------
-    tracks
-        Trajectories; not changed.
-
-    Returns
-    -------
-    Tracks
-        The rows that do not touch the border; ``provenance["cut_cells_left_out"]`` counts the
-        others.
-    """
-    whole = ~tracks.table["touches_border"].to_numpy(dtype=bool)
-    return replace(
-        tracks,
-        table=tracks.table[whole],
-        provenance={**tracks.provenance, "cut_cells_left_out": int(np.sum(~whole))},
-    )
-
-
-def smooth_tracks(tracks: Tracks, points: int = 5) -> Tracks:
+def smooth(paths: Trajectories, points: int = 5, *, overwrite: bool = False) -> Trajectories:
     """Smooth positions with a centred moving average over time.
 
     ``x'(t) = (2h + 1)^-1 sum_{s=-h..h} x(t + s)`` with ``h = (points - 1)/2`` inside a run of
@@ -120,133 +238,53 @@ def smooth_tracks(tracks: Tracks, points: int = 5) -> Tracks:
 
     Parameters
     ----------
-    tracks
-        Trajectories; not changed.
+    paths
+        Trajectories.
     points
-        Width of the average in frames, odd; 1 returns the positions unchanged.
+        Width of the average in frames, odd; 1 returns them unchanged.
+    overwrite
+        Whether the arrays of `paths` are used for the result, which saves their memory.
 
     Returns
     -------
-    Tracks
-        The same table with new x and y, and ``smoothing = points``.
+    Trajectories
 
     Raises
     ------
     ValueError
-        If points is even or below 1, or the tracks have been smoothed before.
+        If points is even or below 1.
     """
     if points < 1 or points % 2 == 0:
         raise ValueError(f"points must be an odd number >= 1, got {points}")
     if points == 1:
-        return tracks
-    if tracks.smoothing != 1:
-        raise ValueError(
-            f"tracks must not be smoothed twice, but they carry smoothing = {tracks.smoothing}; "
-            "start from the unsmoothed tracks"
-        )
-    table = ordered_rows(tracks.table)
-    track, frame, x, y, finite = _arrays(table)
-    position, length = _segments(track, frame, finite)
-    half = np.minimum(np.minimum(position, length - 1 - position), (points - 1) // 2)
-    half = np.maximum(half, 0)
-    smooth_x, smooth_y = x.copy(), y.copy()
-    for offset in range(1, (points - 1) // 2 + 1):
-        rows = np.flatnonzero(half >= offset)
-        smooth_x[rows] += x[rows - offset] + x[rows + offset]
-        smooth_y[rows] += y[rows - offset] + y[rows + offset]
-    table = table.assign(x=smooth_x / (2 * half + 1), y=smooth_y / (2 * half + 1))
-    return replace(tracks, table=table, smoothing=points)
+        return paths
+    reach = (points - 1) // 2
+    out = (paths.x, paths.y) if overwrite else (paths.x.copy(), paths.y.copy())
+    centre = paths.centre.copy()
+    for first, last in paths.spans():
+        entries, track = paths.rows_of(first, last)
+        valid = paths.valid[entries]
+        place, length = _runs(track, valid)
+        half = np.minimum(np.minimum(place, length - 1 - place), reach)
+        half = np.where(valid, np.maximum(half, 0), 0)
+        size = np.maximum(np.bincount(track - first, weights=valid, minlength=last - first), 1)
+        for axis, (values, target) in enumerate(((paths.x, out[0]), (paths.y, out[1]))):
+            here = values[entries]
+            total = here.copy()
+            for offset in range(1, reach + 1):
+                rows = np.flatnonzero(half >= offset)
+                total[rows] += here[rows - offset] + here[rows + offset]
+            total /= 2 * half + 1
+            target[entries] = total
+            mean = np.bincount(track - first, weights=total, minlength=last - first) / size
+            centre[first:last, axis] = paths.start[first:last, axis] + mean
+    return replace(paths, x=out[0], y=out[1], centre=centre)
 
 
-def remove_drift(tracks: Tracks) -> Tracks:
-    """Express trajectories relative to the centre of mass of the population.
-
-    ``R(t) = sum_{s <= t} mean_i [r_i(s) - r_i(s - 1)]``, the mean over the cells present in both
-    frames, is subtracted from every position. Summing steps of the same cells, instead of
-    averaging positions, keeps a cell that enters or leaves from moving the centre of mass.
-
-    Undefined when fewer than 8 cells are common to two successive frames: that step is then
-    taken as zero, and counted in ``provenance["drift"]["steps_kept"]``. The mean-square
-    displacement of independent cells comes out low by a factor ``1 - 1/n`` with n common cells.
-
-    Parameters
-    ----------
-    tracks
-        Trajectories; not changed.
-
-    Returns
-    -------
-    Tracks
-        The same table with new x and y; ``provenance["drift"]`` says what was done.
-    """
-    table = ordered_rows(tracks.table)
-    track, frame, x, y, finite = _arrays(table)
-    rows = np.flatnonzero(finite)
-    present, index = np.unique(frame[rows], return_inverse=True)
-    same = (track[rows][1:] == track[rows][:-1]) & (np.diff(index) == 1)
-    step = index[1:][same]
-    count = np.bincount(step, minlength=present.size)
-    trusted = count >= MIN_DRIFT_CELLS
-    shift = np.zeros((2, present.size))
-    for axis, values in enumerate((x[rows], y[rows])):
-        total = np.bincount(step, weights=np.diff(values)[same], minlength=present.size)
-        shift[axis] = np.cumsum(np.where(trusted, total / np.maximum(count, 1), 0.0))
-    x[rows] -= shift[0, index]
-    y[rows] -= shift[1, index]
-    kept = int(np.sum(~trusted[1:]))
-    drift = {"removed": kept < present.size - 1, "steps_kept": kept, "min_cells": MIN_DRIFT_CELLS}
-    return replace(
-        tracks,
-        table=table.assign(x=x, y=y),
-        provenance={**tracks.provenance, "drift": drift},
-    )
-
-
-def longest_runs(table: pd.DataFrame) -> pd.Series:
-    """Longest run of consecutive frames with a position, per track.
-
-    Parameters
-    ----------
-    table
-        Columns track_id, frame, x, y, sorted by track and frame.
-
-    Returns
-    -------
-    pandas.Series
-        Number of frames, indexed by track_id.
-    """
-    track, frame, _, _, finite = _arrays(table)
-    _, length = _segments(track, frame, finite)
-    return pd.Series(length).groupby(track).max()
-
-
-def retain(tracks: Tracks, min_points: int = 24) -> Tracks:
-    """Keep the tracks that have enough consecutive points.
-
-    A track stays, whole, when its longest run of consecutive frames with a position has at
-    least `min_points` points.
-
-    Parameters
-    ----------
-    tracks
-        Trajectories; not changed.
-    min_points
-        Consecutive points a track must have, >= 1.
-
-    Returns
-    -------
-    Tracks
-        The kept tracks, perhaps none.
-
-    Raises
-    ------
-    ValueError
-        If min_points is below 1.
-    """
-    if min_points < 1:
-        raise ValueError(f"min_points must be >= 1, got {min_points}")
-    table = ordered_rows(tracks.table)
-    runs = longest_runs(table)
-    kept = runs.index[runs.to_numpy() >= min_points]
-    table = table[table["track_id"].isin(kept)].reset_index(drop=True)
-    return replace(tracks, table=table)
+def _runs(track: IntArray, valid: Any) -> tuple[IntArray, IntArray]:
+    """Place of each entry in its run of entries with a position, and the length of that run."""
+    new = np.ones(track.size, dtype=bool)
+    new[1:] = (track[1:] != track[:-1]) | (valid[1:] != valid[:-1])
+    run = np.cumsum(new) - 1
+    first = np.flatnonzero(new)
+    return np.arange(track.size) - first[run], np.diff(np.r_[first, track.size])[run]

@@ -1,13 +1,13 @@
 """Trajectories as arrays: one stretch per track, a frame without a position marked as missing."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from cellquant.observables.smoothing import FloatArray, IntArray, ordered_rows
-from cellquant.tables import Tracks
-
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 
@@ -66,59 +66,98 @@ class Trajectories:
         """Largest frame difference inside one track."""
         return int(np.max(np.diff(self.offsets), initial=1)) - 1
 
+    def spans(self, size: int = 2**15) -> Iterator[tuple[int, int]]:
+        """Half-open ranges of tracks that hold about `size` entries each, all tracks in turn.
 
-def from_tracks(tracks: Tracks) -> Trajectories:
-    """Lay a table of tracks out as arrays.
+        What is worked out range by range costs memory for one range at a time.
+        """
+        first = 0
+        while first < self.n_tracks:
+            last = int(np.searchsorted(self.offsets, self.offsets[first] + size))
+            last = min(max(last, first + 1), self.n_tracks)
+            yield first, last
+            first = last
+
+    def rows_of(self, first: int, last: int) -> tuple[slice, IntArray]:
+        """Entries of a range of tracks, and the track of each entry."""
+        length = np.diff(self.offsets[first : last + 1])
+        entries = slice(int(self.offsets[first]), int(self.offsets[last]))
+        return entries, np.repeat(np.arange(first, last), length)
+
+    def inside(self, start: int, stop: int) -> "Trajectories":
+        """The points in the frames from start up to, not including, stop, as tracks of their own.
+
+        Tracks without a point there are left out.
+        """
+        begin = np.maximum(self.first_frame, start - self.origin_frame)
+        end = np.minimum(self.first_frame + np.diff(self.offsets), stop - self.origin_frame)
+        length = np.maximum(end - begin, 0)
+        row = np.repeat(np.arange(self.n_tracks), length)
+        within = np.arange(row.size) - np.repeat(np.cumsum(length) - length, length)
+        frame = begin[row] + within
+        entry = self.offsets[row] + frame - self.first_frame[row]
+        known = self.valid[entry]
+        row, frame, entry = row[known], frame[known], entry[known]
+        starts = np.flatnonzero(np.diff(row, prepend=-1))
+        track = row[starts]
+        stops = np.r_[starts[1:], row.size] if starts.size else starts
+        layout = Layout(frame[starts] + self.origin_frame, frame[stops - 1] + self.origin_frame)
+        number = np.repeat(np.arange(starts.size), stops - starts)
+        layout.add(number, frame + self.origin_frame, self.x[entry], self.y[entry])
+        layout.start += self.start[track]
+        layout.centre += self.start[track]
+        return layout.trajectories(frame_interval=self.frame_interval, box=self.box)
+
+
+class Layout:
+    """Trajectories while they are filled in, a few tracks at a time.
 
     Parameters
     ----------
-    tracks
-        Trajectories; rows without a finite position count as missing frames.
-
-    Returns
-    -------
-    Trajectories
-
-    Raises
-    ------
-    InputError
-        If a track has two rows in one frame.
+    first, last
+        (n_tracks,) first and last frame number with a position of each track.
     """
-    table = ordered_rows(tracks.table)
-    x, y = table["x"].to_numpy(dtype=np.float64), table["y"].to_numpy(dtype=np.float64)
-    track = table["track_id"].to_numpy(dtype=np.int64)
-    frame = table["frame"].to_numpy(dtype=np.int64)
-    finite = np.isfinite(x) & np.isfinite(y)
-    x, y, track, frame = x[finite], y[finite], track[finite], frame[finite]
-    starts = np.flatnonzero(np.r_[True, track[1:] != track[:-1]]) if track.size else track[:0]
-    stops = np.r_[starts[1:], track.size] if track.size else starts
-    first, last = frame[starts], frame[stops - 1]
-    offsets = np.r_[0, np.cumsum(last - first + 1)].astype(np.int64)
-    row = np.repeat(np.arange(starts.size), stops - starts)
-    entry = offsets[row] + frame - first[row]
-    layout = {name: np.zeros(int(offsets[-1])) for name in ("x", "y")}
-    layout["x"][entry] = x - x[starts][row]
-    layout["y"][entry] = y - y[starts][row]
-    valid = np.zeros(int(offsets[-1]), dtype=bool)
-    valid[entry] = True
-    size = np.maximum(stops - starts, 1)
-    centre = np.column_stack(
-        [np.bincount(row, weights=v, minlength=starts.size) / size for v in (x, y)]
-    )
-    origin = int(frame.min()) if frame.size else 0
-    return Trajectories(
-        x=layout["x"],
-        y=layout["y"],
-        valid=valid,
-        offsets=offsets,
-        first_frame=first - origin,
-        start=np.column_stack([x[starts], y[starts]]),
-        centre=centre,
-        origin_frame=origin,
-        n_frames=int(frame.max()) - origin + 1 if frame.size else 0,
-        frame_interval=tracks.frame_interval,
-        box=tracks.box,
-    )
+
+    def __init__(self, first: IntArray, last: IntArray) -> None:
+        self.first, self.last = first, last
+        self.offsets = np.r_[0, np.cumsum(last - first + 1)].astype(np.int64)
+        size = int(self.offsets[-1])
+        self.x, self.y = np.zeros(size), np.zeros(size)
+        self.valid = np.zeros(size, dtype=bool)
+        self.start, self.centre = np.zeros((first.size, 2)), np.zeros((first.size, 2))
+
+    def add(self, track: IntArray, frame: IntArray, x: FloatArray, y: FloatArray) -> None:
+        """Fill in whole tracks, given by their number, in the order of track and frame."""
+        starts = np.flatnonzero(np.diff(track, prepend=-1))
+        if not starts.size:
+            return
+        number, size = track[starts], np.diff(np.r_[starts, track.size])
+        row = np.repeat(np.arange(starts.size), size)
+        entry = self.offsets[track] + frame - self.first[track]
+        self.valid[entry] = True
+        for axis, (values, target) in enumerate(((x, self.x), (y, self.y))):
+            target[entry] = values - values[starts][row]
+            self.start[number, axis] = values[starts]
+            self.centre[number, axis] = np.bincount(row, weights=values) / size
+
+    def trajectories(
+        self, *, frame_interval: float, box: tuple[float, float] | None
+    ) -> Trajectories:
+        """What has been filled in."""
+        origin = int(self.first.min()) if self.first.size else 0
+        return Trajectories(
+            x=self.x,
+            y=self.y,
+            valid=self.valid,
+            offsets=self.offsets,
+            first_frame=self.first - origin,
+            start=self.start,
+            centre=self.centre,
+            origin_frame=origin,
+            n_frames=int(self.last.max()) - origin + 1 if self.last.size else 0,
+            frame_interval=frame_interval,
+            box=box,
+        )
 
 
 def log_lags(max_lag: int, n: int = 35) -> IntArray:

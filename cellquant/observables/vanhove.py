@@ -1,5 +1,6 @@
 """Distribution of displacements at one lag, its Gaussian core and its exponential tail."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,13 +8,14 @@ import numpy as np
 import pandas as pd
 
 from cellquant.observables.blocks import (
+    Blocks,
     jackknife_error,
     leave_one_out,
     spatial_blocks,
 )
 from cellquant.observables.core_and_tail import END_OF_CORE, Core, Tail, fit_core_and_tail
-from cellquant.observables.smoothing import FloatArray, IntArray
-from cellquant.observables.trajectories import Trajectories
+from cellquant.observables.motion import displacements, lengths
+from cellquant.observables.trajectories import FloatArray, IntArray, Trajectories
 
 NORMALISATIONS = {
     "areal": "2 pi int G_s r dr = 1: probability per area",
@@ -44,29 +46,6 @@ class VanHove:
     table: pd.DataFrame
     components: pd.DataFrame
     fits: dict[str, Any]
-
-
-def displacements(paths: Trajectories, lag: int) -> tuple[FloatArray, FloatArray, IntArray]:
-    """All displacements over a lag.
-
-    Parameters
-    ----------
-    paths
-        Trajectories.
-    lag
-        Lag in frames, >= 1.
-
-    Returns
-    -------
-    dx, dy : numpy.ndarray
-        (n,) components in length units.
-    track : numpy.ndarray
-        (n,) index of the track.
-    """
-    row = np.repeat(np.arange(paths.n_tracks), np.diff(paths.offsets))
-    both = paths.valid[:-lag] & paths.valid[lag:] & (row[lag:] == row[:-lag])
-    i = np.flatnonzero(both)
-    return paths.x[i + lag] - paths.x[i], paths.y[i + lag] - paths.y[i], row[i]
 
 
 def self_van_hove(
@@ -120,10 +99,9 @@ def self_van_hove(
     """
     if lag < 1:
         raise ValueError(f"lag must be >= 1 frame, got {lag}")
-    dx, dy, track = displacements(paths, lag)
     blocks = spatial_blocks(paths.centre, box=paths.box)
-    block = blocks.index[track]
-    r = np.hypot(dx, dy) / unit
+    r, block = lengths(paths, lag, blocks)
+    r /= unit
     fits: dict[str, Any] = {
         "n": int(r.size),
         "sigma2": None, "sigma2_std_error": None, "component_variance": None,
@@ -143,7 +121,8 @@ def self_van_hove(
         tail = fitted[2] if fitted[2].reason is None else None
     table = _histogram(r, block, blocks.n, core, tail)
     _goodness(table, fits)
-    return VanHove(table, _components(dx / unit, dy / unit, block, blocks.n), fits)
+    spread = float(np.sqrt(np.mean(r * r) / 2)) if r.size else 0.0
+    return VanHove(table, _components(paths, lag, unit, blocks, spread), fits)
 
 
 def _describe(
@@ -245,17 +224,25 @@ def _goodness(table: pd.DataFrame, fits: dict[str, Any]) -> None:
             fits[f"{name}_chi2_per_dof"] = float(np.sum(pull**2) / (used.sum() - 2))
 
 
-def _components(dx: FloatArray, dy: FloatArray, block: IntArray, n: int) -> pd.DataFrame:
+def _components(
+    paths: Trajectories, lag: int, unit: float, blocks: Blocks, spread: float
+) -> pd.DataFrame:
     """Distribution of dx and dy, pooled: the one-dimensional van Hove function."""
     names = ("displacement", "value", "std_error")
-    spread = float(np.sqrt(np.mean(dx**2 + dy**2) / 2)) if dx.size else 0.0
     if spread == 0.0:
         return pd.DataFrame({**{k: np.empty(0) for k in names}, "n": np.empty(0, np.int64)})
-    reach = float(max(np.abs(dx).max(), np.abs(dy).max()))
+
+    def parts() -> Iterator[tuple[FloatArray, IntArray]]:
+        for first, last in paths.spans():
+            dx, dy, track, _ = displacements(paths, lag, first=first, last=last)
+            for component in (dx, dy):
+                yield component / unit, blocks.index[track]
+
+    reach = max(float(np.abs(component).max(initial=0.0)) for component, _ in parts())
     half = int(np.clip(np.ceil(reach / (0.2 * spread)), 10, 200))
     edges = np.linspace(-reach, reach, 2 * half + 1)
-    hits = np.zeros((n, 2 * half))
-    for component in (dx, dy):
+    hits = np.zeros((blocks.n, 2 * half))
+    for component, block in parts():
         place = np.clip(np.searchsorted(edges, component, side="right") - 1, 0, 2 * half - 1)
         np.add.at(hits, (block, place), 1.0)
     size = hits.sum(axis=1)

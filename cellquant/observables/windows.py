@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cellquant.observables.smoothing import FloatArray
+from cellquant.observables.trajectories import FloatArray, IntArray
+from cellquant.rows import Piece, Scan, rows_of
 from cellquant.tables import Cells, Tracks, Units
 
 BIN_WIDTH = 250.0
@@ -60,35 +61,17 @@ def split_frames(first: int, n_frames: int, points: int) -> list[Window]:
     return [Window(first + k * points, first + (k + 1) * points) for k in range(n_frames // points)]
 
 
-class RowsByFrame:
-    """The rows of a table found by frame, at the cost of the rows that are found.
-
-    Parameters
-    ----------
-    table
-        Any table with a column frame.
-    """
-
-    def __init__(self, table: pd.DataFrame) -> None:
-        frame = table["frame"].to_numpy()
-        self._table = table
-        self._order = np.argsort(frame, kind="stable")
-        self._frame = frame[self._order]
-
-    def inside(self, window: Window) -> pd.DataFrame:
-        """Rows of the frames of a window, in the order of the table."""
-        first, last = np.searchsorted(self._frame, (window.start, window.stop))
-        rows: pd.DataFrame = self._table.iloc[np.sort(self._order[first:last])]
-        return rows
-
-
-def density_per_frame(source: Tracks | Cells) -> pd.DataFrame:
+def density_per_frame(
+    source: Tracks | Cells | Scan, census: "Census | None" = None
+) -> pd.DataFrame:
     """Number density of every frame.
 
     Parameters
     ----------
     source
         Tracks or cells; all rows count, whatever the length of their track.
+    census
+        Its rows, where they have been counted.
 
     Returns
     -------
@@ -96,26 +79,76 @@ def density_per_frame(source: Tracks | Cells) -> pd.DataFrame:
         frame, n_cells, density (inverse length squared, half weight for cells that touch the
         border), count_per_area (the plain count). Frames without cells count as zero.
     """
-    frame = source.table["frame"].to_numpy(dtype=np.int64)
-    first = 0 if isinstance(source, Cells) else int(frame.min(initial=0))
-    last = source.n_frames - 1 if isinstance(source, Cells) else int(frame.max(initial=-1))
-    if isinstance(source, Tracks) and frame.size:
-        first = int(frame.min())
-    n = last - first + 1
-    border = source.table["touches_border"].to_numpy(dtype=bool)
-    count = np.bincount(frame - first, minlength=n)[:n] if frame.size else np.zeros(n)
-    weight = np.where(border, 0.5, 1.0)
-    weighted = np.bincount(frame - first, weights=weight, minlength=n)[:n] if frame.size else count
-    area = source.occupied_area if isinstance(source, Cells) else np.full(n, source.area)
+    head = source.head if isinstance(source, Scan) else source
+    found = count_by_frame(source) if census is None else census
+    if isinstance(head, Cells):
+        first, n, area = 0, head.n_frames, head.occupied_area
+    else:
+        first, n = found.first_frame, found.n_frames
+        area = np.full(n, head.area)
+    count, halves = np.zeros(n), np.zeros(n)
+    place = found.frame - first
+    count[place], halves[place] = found.n_cells, 0.5 * found.n_cut
     with np.errstate(divide="ignore", invalid="ignore"):
         return pd.DataFrame(
             {
                 "frame": np.arange(first, first + n),
                 "n_cells": count.astype(np.int64),
-                "density": np.where(area > 0, weighted / area, np.nan),
+                "density": np.where(area > 0, (count - halves) / area, np.nan),
                 "count_per_area": np.where(area > 0, count / area, np.nan),
             }
         )
+
+
+@dataclass(frozen=True)
+class Census:
+    """Rows of a table, counted.
+
+    Attributes
+    ----------
+    frame, n_cells, n_cut
+        Frames with a row, their rows, and how many of these touch the border of the image.
+    n_rows, n_tracks
+        Rows, and distinct tracks (0 of cells).
+    """
+
+    frame: Any
+    n_cells: Any
+    n_cut: Any
+    n_rows: int
+    n_tracks: int
+
+    @property
+    def first_frame(self) -> int:
+        """Smallest frame number, 0 where there is no row."""
+        return int(self.frame[0]) if self.frame.size else 0
+
+    @property
+    def n_frames(self) -> int:
+        """Frames from the smallest to the largest number."""
+        return int(self.frame[-1]) - self.first_frame + 1 if self.frame.size else 0
+
+
+def count_by_frame(source: Tracks | Cells | Scan) -> Census:
+    """Count the rows of each frame, and the tracks."""
+    rows = rows_of(source)
+    columns = ("frame", "touches_border", *(("track_id",) if rows.linked else ()))
+    n_rows = n_tracks = 0
+    frames = [np.empty(0, dtype=np.int64)]
+    cells, cut = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+    for piece in rows.pieces(*columns):
+        present, index = np.unique(piece["frame"], return_inverse=True)
+        frames.append(present)
+        cells.append(np.bincount(index, minlength=present.size))
+        cut.append(np.bincount(index[piece["touches_border"]], minlength=present.size))
+        n_rows += piece["frame"].size
+        if rows.linked:
+            n_tracks += int(np.sum(piece["track_id"][1:] != piece["track_id"][:-1])) + 1
+    frame, index = np.unique(np.concatenate(frames), return_inverse=True)
+    n_cells, n_cut = np.zeros(frame.size, np.int64), np.zeros(frame.size, np.int64)
+    np.add.at(n_cells, index, np.concatenate(cells))
+    np.add.at(n_cut, index, np.concatenate(cut))
+    return Census(frame, n_cells, n_cut, n_rows, n_tracks)
 
 
 def mean_of_series(values: FloatArray, points: int) -> tuple[float, float, str]:
@@ -170,24 +203,24 @@ def density_scale(units: Units) -> tuple[float, str] | None:
     return (1e6, "1/mm^2") if units.length == "um" else None
 
 
-def mean_diameter(table: pd.DataFrame) -> tuple[float, Any]:
-    """Mean diameter ``d = <sqrt(4 A / pi)>`` of cells away from the border.
+def usable_area(piece: Piece) -> Any:
+    """Which rows have an area that counts for the mean diameter: away from the border, > 0."""
+    area = piece["area"]
+    return np.isfinite(area) & (area > 0) & ~piece["touches_border"]
+
+
+def diameter_by_frame(source: Tracks | Cells | Scan, frames: IntArray) -> tuple[Any, Any]:
+    """Sum and number of the diameters ``sqrt(4 A/pi)`` of cells away from the border, per frame.
 
     Parameters
     ----------
-    table
-        Columns area and touches_border.
-
-    Returns
-    -------
-    diameter : float
-        In length units; NaN without such a cell.
-    rows : numpy.ndarray
-        Which rows were used.
+    frames
+        Increasing frame numbers, all that occur.
     """
-    area = table["area"].to_numpy(dtype=np.float64)
-    usable = np.isfinite(area) & (area > 0)
-    rows = usable & ~table["touches_border"].to_numpy(dtype=bool)
-    if not rows.any():
-        return float("nan"), rows
-    return float(np.mean(np.sqrt(4 * area[rows] / np.pi))), rows
+    total, count = np.zeros(frames.size), np.zeros(frames.size)
+    for piece in rows_of(source).pieces("frame", "area", "touches_border"):
+        used = usable_area(piece)
+        index = np.searchsorted(frames, piece["frame"][used])
+        np.add.at(total, index, np.sqrt(4 * piece["area"][used] / np.pi))
+        np.add.at(count, index, 1.0)
+    return total, count

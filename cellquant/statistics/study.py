@@ -173,7 +173,10 @@ def compare_conditions(trial_values: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def study_statistics(
-    relaxation_times: pd.DataFrame, trial_values: pd.DataFrame | None = None
+    relaxation_times: pd.DataFrame,
+    trial_values: pd.DataFrame | None = None,
+    *,
+    why_empty: str | None = None,
 ) -> dict[str, Any]:
     """Content of ``statistics.json``.
 
@@ -183,20 +186,31 @@ def study_statistics(
         See `tau_alpha_trend`.
     trial_values
         See `compare_conditions`; None when there is nothing to compare.
+    why_empty
+        Why relaxation_times has no row, where that is known.
 
     Returns
     -------
     dict
-        mixed_model (per condition), tau_alpha_by_bin, mann_whitney, censoring (the rule).
-        JSON-ready: None instead of NaN.
+        mixed_model (per condition), tau_alpha_by_bin, mann_whitney, censoring (the rule). What is
+        empty has its reason beside it: mixed_model_reason, tau_alpha_by_bin_reason,
+        mann_whitney_reason. JSON-ready: None instead of NaN.
     """
     tests = [] if trial_values is None else compare_conditions(trial_values)
-    return {
+    means = means_by_bin(relaxation_times)
+    found: dict[str, Any] = {
         "mixed_model": _plain(tau_alpha_trend(relaxation_times)),
-        "tau_alpha_by_bin": _plain(means_by_bin(relaxation_times).to_dict("records")),
+        "tau_alpha_by_bin": _plain(means.to_dict("records")),
         "mann_whitney": _plain(tests),
-        "censoring": CENSORING_RULE,
     }
+    if not len(relaxation_times):
+        why_empty = why_empty or "no window of any stack has a density inside a bin"
+        found["mixed_model_reason"] = found["tau_alpha_by_bin_reason"] = why_empty
+    elif not len(means):
+        found["tau_alpha_by_bin_reason"] = "no density lies in a bin"
+    if not tests:
+        found["mann_whitney_reason"] = "there is one condition, and nothing to compare it with"
+    return {**found, "censoring": CENSORING_RULE}
 
 
 def _plain(value: Any) -> Any:
