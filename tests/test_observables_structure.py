@@ -122,6 +122,15 @@ def test_hexatic_order_and_distances_agree_with_freud() -> None:
     np.testing.assert_allclose(g["value"], rdf.rdf, atol=0.02)
 
 
+def test_the_peak_is_that_of_the_spacing_also_where_nuclei_alone_are_seen() -> None:
+    rng = np.random.default_rng(11)
+    place, box = triangular(14)
+    moved = place[:, None] + rng.normal(0, 0.06, (196, 12, 2))
+    for diameter in (1.05, 0.4):
+        peak = structure_factor(tracks_of(moved, box=box), diameter=diameter).peak
+        assert peak["q_peak"] == pytest.approx(4 * np.pi / np.sqrt(3), rel=0.01)
+
+
 def test_open_field_leaves_out_the_hull_and_the_border() -> None:
     rng = np.random.default_rng(7)
     place = rng.uniform(0, 10, (200, 1, 2))

@@ -167,10 +167,12 @@ def _overlap(context: Context, out: Results, table: str, key: str) -> None:
         out.summary["overlap"] = {"cutoff": cutoff, "cutoff_rule": _cutoff_rule(context)}
     if "chi4" in context.wanted:
         out.tables["chi4"] = found.susceptibility
-        out.summary["chi4_peak"] = {
-            **_peak(found.susceptibility, "jackknife over stretches of time origins"),
-            "cutoff": cutoff,
-        }
+        peak = _peak(found.susceptibility, "jackknife over stretches of time origins")
+        if peak["value"] is not None and not np.isfinite(peak["std_error"]):
+            peak["std_error_reason"] = (
+                "fewer than four stretches of time origins, each twice this lag, fit into the movie"
+            )
+        out.summary["chi4_peak"] = {**peak, "cutoff": cutoff}
 
 
 def _cutoff_rule(context: Context) -> str:

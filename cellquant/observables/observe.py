@@ -262,6 +262,12 @@ def _head(context: Context) -> dict[str, Any]:
         "n_tracks": census.n_tracks if isinstance(head, Tracks) else None,
         "length_unit": head.units.length,
         "time_unit": head.units.time,
+        "unit_rule": (
+            "densities carry their own unit; lengths, wave numbers, times, speeds and diffusion "
+            f"coefficients are in {head.units.length}, 1/{head.units.length}, {head.units.time}, "
+            f"{head.units.length}/{head.units.time} and {head.units.length}^2/{head.units.time}; "
+            "sigma2, xi and the ranges of van_hove in the unit given there; the rest has none"
+        ),
     }
 
 

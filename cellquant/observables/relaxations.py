@@ -67,6 +67,8 @@ def tau_alpha(context: Context, out: Results) -> None:
         }  # fmt: skip
         return
     out.summary["tau_alpha"] = time_entry(context.tau)
+    out.summary["tau_alpha"]["n_tracks"] = context.paths.n_tracks
+    out.summary["tau_alpha"]["n_pairs"] = int(context.whole_scattering.counts.sum())
     out.summary["tau_alpha"]["stretched_exponential"] = context.stretched.as_dict()
     out.summary["tau_alpha"]["std_error_method"] = (
         "bootstrap over blocks: " + context.whole_scattering.method.removeprefix("jackknife over ")

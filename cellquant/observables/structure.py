@@ -158,15 +158,17 @@ def structure_factor(
     source
         Tracks, cells, or a layer.
     diameter
-        Mean cell diameter, to place the search for the first peak; from the density when None.
+        Mean cell diameter, for the default of max_wave_number.
     max_frames
         Frames used, evenly spaced.
     max_wave_number
-        Largest q; four times ``2 pi/diameter`` when None.
+        Largest q; four times ``2 pi/diameter``, at least twice ``2 pi sqrt(density)``, when None.
 
     Returns
     -------
     StructureFactor
+        The first peak is the highest shell between 0.6 and 1.6 times ``2 pi sqrt(density)``, the
+        wave number of the spacing of the cells, refined by a parabola.
         Errors: spread of the time-averaged values over the vectors of a shell, of the peak:
         jackknife over eight interleaved groups of vectors. Undefined with fewer than two cells
         or no extent in x or y. Bias: in an open field that cells fill unevenly, the smallest q
@@ -185,8 +187,10 @@ def structure_factor(
         reason = "fewer than two cells in every frame, or all on a line"
         return StructureFactor(empty, {**none, "reason": reason})
     density = float(np.mean([len(p) for p in frames])) / float(np.prod(layer.edges))
-    scale = 2 * np.pi / diameter if diameter else 2 * np.pi * np.sqrt(density)
-    limit = 4 * scale if max_wave_number is None else max_wave_number
+    # The peak is that of the spacing of the cells: of nuclei alone d is much smaller than it.
+    scale = 2 * np.pi * float(np.sqrt(density))
+    limit = max(4 * 2 * np.pi / diameter if diameter else 0.0, 2 * scale)
+    limit = limit if max_wave_number is None else max_wave_number
     step = 2 * np.pi / layer.edges
     # A field very large for its cells is measured up to the q that half a million vectors reach.
     limit = min(limit, float(np.sqrt(5e5 * np.prod(step))))
@@ -244,7 +248,10 @@ def _first_peak(
         return {**none, "reason": "fewer than three shells lie where the first peak is expected"}
     k = int(np.flatnonzero(window)[np.argmax(value[window])])
     if k in (np.flatnonzero(window)[0], np.flatnonzero(window)[-1]):
-        return {**none, "reason": "S(q) has no maximum between 0.6 and 1.6 times 2 pi/d"}
+        return {
+            **none,
+            "reason": "S(q) has no maximum between 0.6 and 1.6 times 2 pi sqrt(density)",
+        }
     # |sum exp(-i q r)|^2/N of independent points is exponential with mean and spread 1; of a
     # crystal it differs so much between the vectors of a shell that only this bound is of use.
     scatter = 1 / np.sqrt(counts[:, k].sum())
@@ -309,7 +316,8 @@ def pair_correlation(
         Errors: jackknife over blocks of cells; in an open field these include the difference
         between border and centre and are too large at long range. The peak is the highest ring,
         refined by a parabola whose weights fall off over two rings around its own vertex, which
-        lowers a narrow peak. Empty with fewer than two cells; no peak where no ring exceeds 1 at a level of 1 % for all of them together.
+        lowers a narrow peak. Empty with fewer than two cells; no peak where no ring exceeds 1 at
+        a level of 1 % for all of them together.
     """
     layer = layer_of(source, max_frames=max_frames)
     names = ("distance", "value", "std_error")
