@@ -17,6 +17,7 @@ _SPREAD = (0.2, 5.0)
 _SHAPE_TAIL = 5.0
 _SHAPE_FLOOR = 0.05
 _PRIOR_LINKS = 10.0
+_PRIOR_INFORMATIVE = 0.9
 _FIT_LINKS = 10000  # links that a fit looks at, evenly taken
 _PRIOR_SCALE = 0.15  # of the spacing
 
@@ -58,13 +59,19 @@ class Motion:
 
 @dataclass(frozen=True)
 class Shapes:
-    """How much of a cell's shape survives a frame, against the spread in the population."""
+    """How much of a cell's shape survives a frame, against the spread in the population.
+
+    ``spread`` (N,) says how many times wider the change is at each cell;
+    ``informative`` (N,) is the chance that its next shape tells more than that of any cell.
+    """
 
     typical: FloatArray
     memory: FloatArray
     link_precision: FloatArray
     population_precision: FloatArray
     constant: float
+    spread: FloatArray
+    informative: FloatArray
 
 
 def paths(movie: Movie, links: Links | None, flow: FloatArray, carried: FloatArray) -> Paths:
@@ -208,10 +215,18 @@ def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Moti
 
 
 def _stirred(movie: Movie, links: Links) -> IntArray:
-    """1 for the cells (N,) beside one that vanishes or divides before the next frame."""
+    """1 for the cells (N,) that vanish before the next frame, or lie beside one that vanishes or
+    divides."""
     event = (links.after < 0) | (links.second >= 0)
-    beside = event[movie.neighbours[:, :NEAR]]
-    found: IntArray = np.asarray(beside.any(axis=1), dtype=np.int64)
+    # Which of two neighbours vanished is often in doubt: both may be the one that moved in.
+    found: IntArray = ((links.after < 0) | event[movie.neighbours[:, :NEAR]].any(axis=1)) * 1
+    return found
+
+
+def _bereft(movie: Movie, links: Links) -> IntArray:
+    """1 for the cells (N,) that vanish before the next frame, or lie beside one that does."""
+    gone = links.after < 0
+    found: IntArray = (gone | gone[movie.neighbours[:, :NEAR]].any(axis=1)) * 1
     return found
 
 
@@ -270,8 +285,14 @@ def _student_fit(
     return coefficient, scale, nu
 
 
-def fit_shapes(movie: Movie, source: IntArray, target: IntArray, weight: FloatArray) -> Shapes:
+def fit_shapes(movie: Movie, links: Links | None) -> Shapes:
     """Fit the change of shape along links and the spread of shapes in the population."""
+    source = target = np.empty(0, dtype=np.int64)
+    weight = np.empty(0)
+    if links is not None:
+        source = np.flatnonzero((links.after >= 0) & (links.second < 0))
+        target = links.after[source]
+        weight = links.confidence[target]
     shape = movie.shape
     f = shape.shape[1]
     typical = np.median(shape, axis=0)
@@ -286,20 +307,63 @@ def fit_shapes(movie: Movie, source: IntArray, target: IntArray, weight: FloatAr
     centred = shape - typical
     floor = _SHAPE_FLOOR**2 * np.eye(f)
     population = _robust_covariance(centred[whole], np.ones(int(whole.sum()))) + floor
-    if len(source) < 10 * f:
+    if links is None or len(source) < 10 * f:
         precision = np.asarray(np.linalg.inv(population), dtype=np.float64)
-        return Shapes(typical, np.zeros(f), precision, precision, 0.0)
+        same = np.ones(movie.n_cells)
+        return Shapes(typical, np.zeros(f), precision, precision, 0.0, same, same)
     a, b = centred[source], centred[target]
     w = weight[:, None]
     # Elongation is a vector: both components share one memory.
     top, bottom = np.sum(w * a * b, axis=0), np.sum(w * a * a, axis=0) + len(source) * floor[0, 0]
     top[1:3], bottom[1:3] = top[1:3].sum(), bottom[1:3].sum()
     memory = np.clip(top / bottom, 0.0, 1.0)
-    change = _robust_covariance(b - memory * a, weight) + floor
+    rest = b - memory * a
+    change = _robust_covariance(rest, weight) + floor
     link_precision = np.asarray(np.linalg.inv(change), dtype=np.float64)
     population_precision = np.asarray(np.linalg.inv(population), dtype=np.float64)
     constant = 0.5 * (np.linalg.slogdet(population)[1] - np.linalg.slogdet(change)[1])
-    return Shapes(typical, memory, link_precision, population_precision, float(constant))
+    square = np.einsum("nf,fg,ng->n", rest, link_precision, rest)
+    # A cell that grows into the place of another may take any shape.
+    bereft = _bereft(movie, links)
+    beside = bereft[source] == 1
+    spread = np.where(bereft == 1, _widening(square[beside], weight[beside], f), 1.0)
+    near = square / spread[source] ** 2
+    far = np.einsum("nf,fg,ng->n", b, population_precision, b)
+    odds = constant - f * np.log(spread[source])
+    odds -= (_SHAPE_TAIL + f) / 2 * (np.log1p(near / _SHAPE_TAIL) - np.log1p(far / _SHAPE_TAIL))
+    informative = np.where(bereft == 1, _informative(odds[beside], weight[beside]), 1.0)
+    return Shapes(
+        typical,
+        memory,
+        link_precision,
+        population_precision,
+        float(constant),
+        spread,
+        informative,
+    )
+
+
+def _widening(square: FloatArray, weight: FloatArray, f: int) -> float:
+    """How many times wider (at least 1) the change of f descriptors is, from squares (L,)."""
+    width = 1.0
+    for _ in range(10):
+        robust = weight * (_SHAPE_TAIL + f) / (_SHAPE_TAIL + square / width) * square / f
+        width = (float(robust.sum()) + _PRIOR_STIRRED) / (float(weight.sum()) + _PRIOR_STIRRED)
+    return float(np.sqrt(np.clip(width, 1.0, _SPREAD[1] ** 2)))
+
+
+def _informative(odds: FloatArray, weight: FloatArray) -> float:
+    """Share of links whose shapes follow the law of links, by expectation maximisation.
+
+    odds (L,) log odds of that law against any two cells.
+    """
+    ratio = np.exp(np.clip(odds, -50.0, 50.0))
+    share = _PRIOR_INFORMATIVE
+    for _ in range(20):
+        found = share * ratio / (share * ratio + 1.0 - share)
+        total = float(np.sum(weight * found)) + _PRIOR_LINKS * _PRIOR_INFORMATIVE
+        share = total / (float(weight.sum()) + _PRIOR_LINKS)
+    return share
 
 
 def _robust_covariance(values: FloatArray, weight: FloatArray) -> FloatArray:
@@ -355,6 +419,8 @@ def gains(
         shapes.link_precision,
         shapes.population_precision,
         shapes.constant,
+        shapes.spread,
+        shapes.informative,
         _SHAPE_TAIL,
         fates.stay,
         fates.vanish,

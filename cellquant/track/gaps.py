@@ -120,9 +120,12 @@ def shape_odds(movie: Movie, shapes: Shapes, source: IntArray, target: IntArray)
     a, b = movie.shape[source] - shapes.typical, movie.shape[target] - shapes.typical
     change = b - shapes.memory * a
     near = np.einsum("nf,fg,ng->n", change, shapes.link_precision, change)
+    near /= shapes.spread[source] ** 2
     far = np.einsum("nf,fg,ng->n", b, shapes.population_precision, b)
-    tail = 5.0
-    odds: FloatArray = shapes.constant - (tail + b.shape[1]) / 2 * (
+    tail, f = 5.0, b.shape[1]
+    odds: FloatArray = shapes.constant - f * np.log(shapes.spread[source]) - (tail + f) / 2 * (
         np.log1p(near / tail) - np.log1p(far / tail)
     )
-    return odds
+    known = shapes.informative[source]
+    mixed: FloatArray = np.log(1.0 - known + known * np.exp(odds))
+    return mixed

@@ -175,6 +175,8 @@ def pair_gains(
     link_precision: FloatArray,
     population_precision: FloatArray,
     shape_constant: float,
+    shape_spread: FloatArray,
+    informative: FloatArray,
     shape_tail: float,
     stay: FloatArray,
     leave: FloatArray,
@@ -240,9 +242,10 @@ def pair_gains(
                         * (shape[j, e] - typical[e])
                     )
             half = (shape_tail + f) / 2
-            value += shape_constant
-            value -= half * (np.log1p(near / shape_tail) - np.log1p(far / shape_tail))
-            gain[i, c] = value
+            near /= shape_spread[i] ** 2
+            odds = shape_constant - f * np.log(shape_spread[i])
+            odds -= half * (np.log1p(near / shape_tail) - np.log1p(far / shape_tail))
+            gain[i, c] = value + np.log(1.0 - informative[i] + informative[i] * np.exp(odds))
 
 
 @njit(cache=True)

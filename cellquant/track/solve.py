@@ -161,7 +161,6 @@ def _start(movie: Movie, options: Options) -> Solution:
         candidates[a] = np.where(found >= 0, found + movie.start[index + 1], -1)
     leaving, entering = places(movie, flow)
     carried = carried_flow(movie, flow)
-    none = np.empty(0, dtype=np.int64)
     return Solution(
         movie=movie,
         flow=flow,
@@ -171,7 +170,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         carried=carried,
         known=_paths(movie, None, flow, carried, options),
         motion=first_motion(movie),
-        shapes=fit_shapes(movie, none, none, np.empty(0)),
+        shapes=fit_shapes(movie, None),
         rates=fit_rates(movie, None, leaving, entering),
     )
 
@@ -198,10 +197,8 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
     assert links is not None
     state.known = _paths(movie, links, state.flow, state.carried, options)
     state.motion = fit_motion(movie, links, state.known, state.motion)
-    single = np.flatnonzero((links.after >= 0) & (links.second < 0))
-    target = links.after[single]
     if options.use_shape:
-        state.shapes = fit_shapes(movie, single, target, links.confidence[target])
+        state.shapes = fit_shapes(movie, links)
     state.rates = fit_rates(movie, links, state.leaving, state.entering)
     if options.divisions and turn == _DIVISION_PASS:
         state.rates = suppose_divisions(state.rates)
