@@ -123,8 +123,10 @@ def shape_odds(movie: Movie, shapes: Shapes, source: IntArray, target: IntArray)
     near /= shapes.spread[source] ** 2
     far = np.einsum("nf,fg,ng->n", b, shapes.population_precision, b)
     tail, f = 5.0, b.shape[1]
-    odds: FloatArray = shapes.constant - f * np.log(shapes.spread[source]) - (tail + f) / 2 * (
-        np.log1p(near / tail) - np.log1p(far / tail)
+    odds: FloatArray = (
+        shapes.constant
+        - f * np.log(shapes.spread[source])
+        - (tail + f) / 2 * (np.log1p(near / tail) - np.log1p(far / tail))
     )
     known = shapes.informative[source]
     mixed: FloatArray = np.log(1.0 - known + known * np.exp(odds))

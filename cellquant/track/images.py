@@ -4,17 +4,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cellquant.track.cues import STRATA
+from cellquant.track.cues import Look
 from cellquant.track.kernels import overlap_shares, patch_correlations
 from cellquant.track.movie import LOG_AREA, FloatArray, IntArray, Movie
 
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
 
-CONTEXTS = STRATA + 3
 # Cells are sampled on a grid that leaves about this many pixels of a typical cell.
 _SAMPLES = 200.0
-_FLOOR = 0.05
+_SLIGHT = 0.05  # intersection over union below which differences do not matter
+_MEET = 0.7  # roots of the area; round cells of one size touch at 1.1
 
 
 class PairImages:
@@ -45,7 +45,6 @@ class PairImages:
         self._patch = max(2, round(1.2 * float(np.sqrt(typical / np.pi))))
         self._kept: dict[tuple[bool, int], np.ndarray[Any, Any]] = {}
         self._families: dict[tuple[int, int, int], FloatArray] = {}
-        self.n_values = 1 if raw is None else 2
 
     def _frame(self, index: int, *, raw: bool) -> np.ndarray[Any, Any]:
         key = (raw, index)
@@ -57,77 +56,105 @@ class PairImages:
             self._kept[key] = stack[place]
         return self._kept[key]
 
-    def families(self, index: int, cells: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Compare mothers with two daughters taken together; cells (L, 3), as `pairs`."""
+    def families(self, index: int, cells: IntArray) -> list[Look]:
+        """Compare mothers with two daughters taken together, laid on each other; cells (L, 3).
+
+        The first look is at the logarithm of the intersection over union, and depends on either
+        change of area; the second is as that of `pairs`.
+        """
         keys = [tuple(row) for row in cells.tolist()]
         new = np.array([key not in self._families for key in keys], dtype=bool)
         if new.any():
-            rows = np.column_stack(self.pairs(index, *cells[new].T))
+            rows = self._compare_families(index, *cells[new].T)
             for key, row in zip(cells[new].tolist(), rows, strict=True):
                 self._families[tuple(key)] = row
         known = np.array([self._families[key] for key in keys])
-        return known[:, : self.n_values], known[:, self.n_values :]
+        values = known[:, : len(known[0]) - 5]
+        return [Look(value, known[:, -5:-1], known[:, -1]) for value in values.T]
 
-    def pairs(
-        self, index: int, source: IntArray, one: IntArray, two: IntArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Compare cells of frame `index` with cells of the next, centroids laid on each other.
+    def _compare_families(
+        self, index: int, mother: IntArray, one: IntArray, two: IntArray
+    ) -> FloatArray:
+        pixels, area = self._pixels, self._area
+        both = area[one] + area[two]
+        weight = (area[one] / both)[:, None]
+        target = weight * pixels[one] + (1.0 - weight) * pixels[two]
+        daughters = np.column_stack((one, two))
+        share = self._shares(index, mother, target - pixels[mother], daughters).sum(axis=1)
+        common = np.minimum(share * area[mother], both)
+        columns = [np.log(common / (area[mother] + both - common) + _SLIGHT)]
+        if self._raw is not None:
+            columns.append(self._correlations(index, mother, target))
+        context, distance = self._context(mother, target, both)
+        context[:, -1] = np.abs(context[:, -1])
+        return np.column_stack((*columns, context, distance))
+
+    def pairs(self, index: int, source: IntArray, targets: IntArray) -> list[Look]:
+        """Compare cells of frame `index` with cells of the next.
 
         Parameters
         ----------
         index
             Index of the frame of the sources.
-        source, one
-            (L,) cells of this frame and of the next.
-        two
-            (L,) second cells of the next frame, taken together with the first.
+        source
+            (L,) cells of this frame.
+        targets
+            (L, K) cells of the next frame; -1 where there is none.
 
         Returns
         -------
-        value : numpy.ndarray
-            (L, Y) logarithm of intersection over union and, with a raw movie, the normalised
-            cross-correlation of the patches.
-        context : numpy.ndarray
-            (L, C) what these depend on in any pair: the stratum of the distance from the expected
-            place, change of area, change of elongation, and the distance.
+        list of Look
+            Each of L K pairs. First the share of the source's mask that falls on the target when
+            it is put where it is expected, unless that is too far for them to meet; then, with a
+            raw movie, the normalised cross-correlation of the patches.
         """
-        movie, pixels, area = self._movie, self._pixels, self._area
-        target, target_area = pixels[one], area[one]
-        turned = np.hypot(*(movie.shape[one, 1:3] - movie.shape[source, 1:3]).T)
-        if two is not None:
-            target_area = area[one] + area[two]
-            weight = (area[one] / target_area)[:, None]
-            target = weight * pixels[one] + (1.0 - weight) * pixels[two]
-            turned = np.zeros(len(source))
-        share = np.empty(len(source))
+        share = self._shares(index, source, self._expected[source] - self._pixels[source], targets)
+        sources, target = np.repeat(source, targets.shape[1]), targets.reshape(-1)
+        place = self._pixels[target]
+        context, distance = self._context(sources, place, self._area[target])
+        meet = (target >= 0) & (distance < _MEET)
+        looks = [Look(np.where(meet, share.reshape(-1), np.nan), context, distance)]
+        if self._raw is not None:
+            alike = self._correlations(index, sources, place)
+            looks.append(Look(np.where(target >= 0, alike, np.nan), context, distance))
+        return looks
+
+    def _shares(
+        self, index: int, source: IntArray, shift: FloatArray, targets: IntArray
+    ) -> FloatArray:
+        share = np.empty(targets.shape)
         overlap_shares(
             self._frame(index, raw=False),
             self._frame(index + 1, raw=False),
-            movie.label[source],
-            pixels[source],
+            self._movie.label[source],
+            self._pixels[source],
             self._half[source],
-            np.rint(target - pixels[source]).astype(np.int64),
-            movie.label[one],
-            movie.label[one if two is None else two],
+            np.rint(shift).astype(np.int64),
+            np.where(targets >= 0, self._movie.label[targets], 0),
             self._stride,
             share,
         )
-        common = np.minimum(share * area[source], target_area)
-        columns = [np.log(common / (area[source] + target_area - common) + _FLOOR)]
-        if self._raw is not None:
-            correlation = np.empty(len(source))
-            patch_correlations(
-                self._frame(index, raw=True),
-                self._frame(index + 1, raw=True),
-                np.rint(pixels[source]).astype(np.int64),
-                np.rint(target).astype(np.int64),
-                self._patch,
-                self._stride,
-                correlation,
-            )
-            columns.append(np.arctanh(np.clip(correlation, -0.999, 0.999)))
-        away = np.hypot(*(target - self._expected[source]).T) / np.sqrt(area[source])
-        change = np.abs(np.log(target_area / area[source]))
-        stratum = np.minimum((away * STRATA).astype(np.int64), STRATA - 1)
-        context = np.column_stack((stratum[:, None] == np.arange(STRATA), change, turned, away))
-        return np.column_stack(columns), context
+        return share
+
+    def _correlations(self, index: int, source: IntArray, place: FloatArray) -> FloatArray:
+        correlation = np.empty(len(source))
+        patch_correlations(
+            self._frame(index, raw=True),
+            self._frame(index + 1, raw=True),
+            np.rint(self._pixels[source]).astype(np.int64),
+            np.rint(place).astype(np.int64),
+            self._patch,
+            self._stride,
+            correlation,
+        )
+        alike: FloatArray = np.arctanh(np.clip(correlation, -0.999, 0.999))
+        return alike
+
+    def _context(
+        self, source: IntArray, place: FloatArray, area: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Constant, distance up to 1, its square, change of area (L, 4); and the distance (L,)."""
+        away = np.hypot(*(place - self._expected[source]).T) / np.sqrt(self._area[source])
+        near = np.minimum(away, 1.0)
+        change = np.log(area / self._area[source])
+        return np.column_stack((np.ones(len(source)), near, near**2, change)), away

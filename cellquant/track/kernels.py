@@ -341,14 +341,14 @@ def overlap_shares(
     centre: FloatArray,
     half: FloatArray,
     shift: IntArray,
-    one: IntArray,
-    two: IntArray,
+    targets: IntArray,
     stride: int,
     share: FloatArray,
 ) -> None:
-    """Share (L,) of each cell that falls on the labels `one` or `two` after an integer shift.
+    """Share (L, K) of each cell that falls on the labels `targets` after an integer shift.
 
-    Only every `stride`-th row and column of the box ``centre +- half`` is visited.
+    Only every `stride`-th row and column of the box ``centre +- half`` is visited; label 0 is no
+    target.
     """
     height, width = here.shape
     for p in range(len(label)):
@@ -357,7 +357,7 @@ def overlap_shares(
         left = max(int(centre[p, 0] - half[p]), 0)
         right = min(int(centre[p, 0] + half[p]) + 2, width)
         size = 0
-        common = 0
+        share[p, :] = 0.0
         for y in range(top, bottom, stride):
             v = y + shift[p, 1]
             for x in range(left, right, stride):
@@ -365,12 +365,14 @@ def overlap_shares(
                     continue
                 size += 1
                 u = x + shift[p, 0]
-                if u < 0 or v < 0 or u >= width or v >= height:
+                if u < 0 or v < 0 or u >= width or v >= height or there[v, u] == 0:
                     continue
-                other = there[v, u]
-                if other == one[p] or other == two[p]:
-                    common += 1
-        share[p] = common / size if size > 0 else np.nan
+                for c in range(targets.shape[1]):
+                    if there[v, u] == targets[p, c]:
+                        share[p, c] += 1.0
+                        break
+        for c in range(targets.shape[1]):
+            share[p, c] = share[p, c] / size if size > 0 else np.nan
 
 
 @njit(cache=True)

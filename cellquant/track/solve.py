@@ -1,7 +1,7 @@
 """Passes over the movie: gains from the present model, best links, a better model."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,11 +19,11 @@ from cellquant.track.costs import (
     gains,
     paths,
 )
-from cellquant.track.cues import Cue, fit_cue
+from cellquant.track.cues import Cue, Look, evidence, fit_cue, joined
 from cellquant.track.divisions import Divisions, fit_divisions, propose
 from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
 from cellquant.track.flow import CANDIDATES, all_flows, nearest_cells
-from cellquant.track.images import CONTEXTS, PairImages
+from cellquant.track.images import PairImages
 from cellquant.track.kernels import marginals
 from cellquant.track.movie import BoolArray, FloatArray, IntArray, Links, Movie
 
@@ -51,17 +51,6 @@ class Options:
     use_images: bool = True
 
 
-@dataclass(frozen=True)
-class Compared:
-    """Candidate links (L,) whose images were compared: source, place among the candidates, what
-    was seen (L, Y) and what that depends on in any pair (L, C); see `PairImages.pairs`."""
-
-    source: IntArray
-    column: IntArray
-    look: FloatArray
-    context: FloatArray
-
-
 @dataclass
 class Solution:
     """Links with the model that they were judged by; refined from pass to pass."""
@@ -79,9 +68,10 @@ class Solution:
     links: Links | None = None
     divisions: Divisions | None = None
     probability: FloatArray | None = None
-    compared: "Compared | None" = None
-    cue: Cue | None = None
-    family_cue: Cue | None = None
+    looked: IntArray | None = None
+    looks: list[Look] | None = None
+    cues: list[Cue | None] = field(default_factory=list)
+    family_cues: list[Cue | None] = field(default_factory=list)
     gain: FloatArray | None = None
     fates: Fates | None = None
 
@@ -209,41 +199,39 @@ def _add_images(state: Solution, images: PairImages) -> None:
     links, gain = state.links, state.gain
     assert links is not None
     assert gain is not None
-    if state.compared is None:
-        state.compared = _compare(state, images)
-    seen = state.compared
-    target = state.candidates[seen.source, seen.column]
-    linked = (links.after[seen.source] == target) & (links.second[seen.source] < 0)
-    stranger = (links.before[target] != seen.source) & (seen.context[:, -1] < 1.0)
-    state.cue = fit_cue(seen.look, seen.context, linked, stranger)
-    if state.cue is not None:
-        gain[seen.source, seen.column] += state.cue.odds(seen.look, seen.context)
+    if state.looked is None or state.looks is None:
+        state.looked, state.looks = _compare(state, images)
+    if not state.looks:
+        return
+    source = state.looked
+    target = state.candidates[source]
+    linked = (links.after[source, None] == target) & (links.second[source, None] < 0)
+    stranger = links.before[target] != source[:, None]
+    state.cues = [fit_cue(look, linked.reshape(-1), stranger.reshape(-1)) for look in state.looks]
+    gain[source] += evidence(state.cues, state.looks).reshape(target.shape)
 
 
-def _compare(state: Solution, images: PairImages) -> Compared:
+def _compare(state: Solution, images: PairImages) -> tuple[IntArray, list[Look]]:
     """Compare doubtful cells with their candidates, and a sample of the others to calibrate."""
     movie, candidates = state.movie, state.candidates
     assert state.probability is not None
     best = state.probability.max(axis=1)
     wanted = (best > _UNLIKELY) & (best < _SETTLED)
     wanted[:: max(1, movie.n_cells // _CALIBRATION_CELLS)] = True
-    wanted &= ~movie.cut
-    whole = (candidates >= 0) & ~movie.cut[candidates]
-    rows, columns = np.nonzero(wanted[:, None] & whole)
-    look, context = np.empty((len(rows), images.n_values)), np.empty((len(rows), CONTEXTS))
-    ends = np.searchsorted(rows, movie.start)
-    for index in range(len(movie.time) - 1):
-        here = slice(ends[index], ends[index + 1])
-        if here.start < here.stop:
-            row, column = rows[here], columns[here]
-            look[here], context[here] = images.pairs(index, row, candidates[row, column])
-    known = np.isfinite(look).all(axis=1)
-    return Compared(rows[known], columns[known], look[known], context[known])
+    wanted[movie.start[-2] :] = False
+    rows = np.flatnonzero(wanted & ~movie.cut)
+    targets = np.where(movie.cut[candidates[rows]], -1, candidates[rows])
+    frame = movie.frame_index[rows]
+    looks = [
+        images.pairs(index, rows[frame == index], targets[frame == index])
+        for index in np.unique(frame).tolist()
+    ]
+    return rows, [joined(list(kind)) for kind in zip(*looks, strict=True)]
 
 
 def _families(
     state: Solution, index: int, orphan: IntArray, middle: FloatArray, images: PairImages | None
-) -> tuple[IntArray, FloatArray, FloatArray]:
+) -> tuple[IntArray, FloatArray, list[Look]]:
     """Divisions worth considering between frame `index` and the next, and their log odds."""
     assert state.divisions is not None
     assert state.fates is not None
@@ -261,11 +249,9 @@ def _families(
         state.fates.appear,
     )
     if images is None or len(gain) == 0:
-        return cells, gain, np.empty((0, 0))
-    value, context = images.families(index, cells)
-    if state.family_cue is not None:
-        gain = gain + state.family_cue.odds(value, context)
-    return cells, gain, np.column_stack((value, context))
+        return cells, gain, []
+    looks = images.families(index, cells)
+    return cells, gain + evidence(state.family_cues, looks), looks
 
 
 def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> Links:
@@ -276,7 +262,7 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
     second, before = after.copy(), after.copy()
     confidence = np.zeros(n)
     everywhere = state.probability = np.zeros(candidates.shape)
-    looks: list[FloatArray] = []
+    looks: list[list[Look]] = []
     looks_taken: list[BoolArray] = []
     for index in range(len(movie.time) - 1):
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
@@ -288,7 +274,8 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
         rows, columns = row + a.start, candidates[a][row, column]
         value = gain[a][row, column]
         families = np.empty((0, 3), dtype=np.int64)
-        odds, seen = np.empty(0), np.empty((0, 0))
+        odds = np.empty(0)
+        seen: list[Look] = []
         if state.divisions is not None:
             reached = np.zeros(n_there)
             np.maximum.at(reached, local[row, column], probability[row, column])
@@ -296,8 +283,8 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
             orphan[b] = reached < _SURE
             families, odds, seen = _families(state, index, orphan, middle, images)
         chosen, split = match_with_divisions(rows, columns, value, families, odds)
-        if len(seen):
-            taken = np.zeros(len(seen), dtype=bool)
+        if seen:
+            taken = np.zeros(len(odds), dtype=bool)
             taken[split] = True
             looks.append(seen)
             looks_taken.append(taken)
@@ -311,6 +298,8 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
             1.0 + np.exp(-np.minimum(odds[split], 50.0))
         )
     if looks:
-        look, taken = np.concatenate(looks), np.concatenate(looks_taken)
-        state.family_cue = fit_cue(look[:, :-CONTEXTS], look[:, -CONTEXTS:], taken, ~taken)
+        taken = np.concatenate(looks_taken)
+        state.family_cues = [
+            fit_cue(joined(list(kind)), taken, ~taken) for kind in zip(*looks, strict=True)
+        ]
     return Links(after, second, before, confidence)
