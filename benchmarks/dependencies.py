@@ -2,9 +2,9 @@
 
     python benchmarks/dependencies.py
 
-Writes docs/dependencies.md from the metadata of the installed packages, following the
-requirements of cellquant without its extras. Known weaknesses are for `pip-audit`, which needs its
-database from the network: `pip-audit -r <(pip freeze)`.
+Writes docs/dependencies.md from the metadata of the installed packages, following the requirements
+of cellquant and of its extras. Known weaknesses are for `pip-audit`, which needs its database from
+the network.
 """
 
 import re
@@ -16,24 +16,28 @@ from packaging.requirements import Requirement
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "dependencies.md"
 
 
-def closure(name: str) -> dict[str, metadata.Distribution]:
-    """Every installed distribution that `name` requires, itself left out."""
+EXTRAS = ("evaluate", "cluster", "geff")
+
+
+def closure(name: str, extra: str = "") -> dict[str, metadata.Distribution]:
+    """Every installed distribution that `name` requires with an extra, itself left out."""
     found: dict[str, metadata.Distribution] = {}
-    waiting = [name]
+    waiting = [(name, extra)]
     while waiting:
-        for text in metadata.distribution(waiting.pop()).requires or ():
+        here, wanted = waiting.pop()
+        for text in metadata.distribution(here).requires or ():
             requirement = Requirement(text)
             key = re.sub(r"[-_.]+", "-", requirement.name).lower()
             marker = requirement.marker
-            if key in found or (marker is not None and not marker.evaluate({"extra": ""})):
+            if key in found or (marker is not None and not marker.evaluate({"extra": wanted})):
                 continue
             found[key] = metadata.distribution(requirement.name)
-            waiting.append(requirement.name)
+            waiting += [(requirement.name, each) for each in ("", *requirement.extras)]
     return found
 
 
 def licence(distribution: metadata.Distribution) -> str:
-    """The licence by expression, by classifier, or by the first words of its text."""
+    """The licence by expression, by classifier, or by its text."""
     content = distribution.metadata
     if content.get("License-Expression"):
         return str(content["License-Expression"])
@@ -42,26 +46,42 @@ def licence(distribution: metadata.Distribution) -> str:
     named = [name for name in named if name != "OSI Approved"]
     if named:
         return ", ".join(named)
-    return (str(content.get("License") or "not stated").strip().splitlines() or ["not stated"])[0][
-        :60
+    if content.get("License"):
+        return str(content["License"]).strip().splitlines()[0][:60]
+    texts = [f.read_text() for f in distribution.files or () if "licen" in f.name.lower()]
+    if any("Redistribution and use in source and binary forms" in text for text in texts):
+        return "BSD, by the text of its licence"
+    return "not stated"
+
+
+def table(found: dict[str, metadata.Distribution]) -> list[str]:
+    return [
+        "| package | version | licence |",
+        "|---|---|---|",
+        *(f"| {name} | {each.version} | {licence(each)} |" for name, each in sorted(found.items())),
+        "",
     ]
 
 
 def main() -> None:
-    rows = sorted(closure("cellquant").items())
+    core = closure("cellquant")
     lines = [
         "# Dependencies",
         "",
-        "What `pip install cellquant` brings along, as last checked; made by",
-        "`python benchmarks/dependencies.py`. Extras (Dask, evaluation, GEFF) are not listed.",
+        "What an installation brings along, as last checked, from the metadata of the installed",
+        "packages; made by `python benchmarks/dependencies.py`. Whether a version has a known",
+        "weakness changes daily and needs a database from the network: `pip install pip-audit`,",
+        "then `pip-audit` in the environment of the installation.",
         "",
-        "| package | version | licence |",
-        "|---|---|---|",
-        *(f"| {name} | {found.version} | {licence(found)} |" for name, found in rows),
+        "## `pip install cellquant`",
         "",
+        *table(core),
     ]
+    for extra in EXTRAS:
+        more = {k: v for k, v in closure("cellquant", extra).items() if k not in core}
+        lines += [f"## `pip install 'cellquant[{extra}]'` brings besides", "", *table(more)]
     PAGE.write_text("\n".join(lines), encoding="utf-8")
-    print(f"{len(rows)} packages")
+    print(f"{len(core)} packages without extras")
 
 
 if __name__ == "__main__":
