@@ -22,11 +22,14 @@ LOCK = ".lock"
 BEAT = 5.0
 STALE = 60.0
 _PAUSE = 0.05
+_held: set[tuple[int, Path]] = set()  # by thread
 
 
 @contextlib.contextmanager
 def only_writer(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Be the only process that writes to a folder while the block runs.
+
+    Inside such a block the same thread may ask for the same folder again.
 
     Parameters
     ----------
@@ -40,6 +43,10 @@ def only_writer(folder: Path, *, wait: bool = False) -> Iterator[None]:
     InputError
         If another process is at work on the folder and `wait` is false.
     """
+    mine = (threading.get_ident(), folder.resolve())
+    if mine in _held:
+        yield
+        return
     path = folder / LOCK
     token = uuid.uuid4().hex
     content = json.dumps({"token": token, **_this_process()}, sort_keys=True)
@@ -77,9 +84,11 @@ def only_writer(folder: Path, *, wait: bool = False) -> Iterator[None]:
     stop = threading.Event()
     beating = threading.Thread(target=_beat, args=(path, stop), daemon=True)
     beating.start()
+    _held.add(mine)
     try:
         yield
     finally:
+        _held.discard(mine)
         stop.set()
         beating.join()
         _remove(path, content)
@@ -113,8 +122,8 @@ def _take(path: Path, content: str) -> bool:
         return True
     except OSError as error:
         raise InputError(
-            f"cannot write to {path.parent}: {error.strerror or error}; choose an output folder "
-            "that you may write to."
+            f"cannot write to {path.parent}: {error.strerror or error}; free space or choose "
+            "another output folder."
         ) from error
     finally:
         own.unlink(missing_ok=True)

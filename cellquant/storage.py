@@ -24,7 +24,7 @@ from typing import Any
 from cellquant import __version__
 from cellquant.errors import InputError
 from cellquant.fingerprint import code_digest
-from cellquant.lock import LOCK
+from cellquant.lock import LOCK, only_writer
 
 MANIFEST = "run.json"
 _LIBRARIES = (
@@ -77,7 +77,7 @@ def replace_together(folder: str | Path) -> Iterator[Path]:
 
     For results that belong together: when one of them cannot be written, all the old ones stay.
     The manifest comes last, and an old one goes first, so that a folder with a manifest never
-    holds a mixture.
+    holds a mixture. Other writers to the folder wait.
 
     Parameters
     ----------
@@ -94,8 +94,16 @@ def replace_together(folder: str | Path) -> Iterator[Path]:
     InputError
         If the folder cannot be made or written, or the disk is full.
     """
-    folder = Path(folder)
-    with _holder(folder, folder) as holder, _clear_errors(folder, holder):
+    folder = make_folder(folder)
+    with (
+        clear_disk_errors(),
+        only_writer(folder, wait=True),
+        _holder(folder, Path("together")) as holder,
+        _clear_errors(folder, holder),
+    ):
+        for left in folder.glob(".together.*.partial"):  # of those that were killed
+            if left != holder:
+                shutil.rmtree(left, ignore_errors=True)
         staged = holder / "staged"
         staged.mkdir()
         yield staged
@@ -114,7 +122,7 @@ def _holder(folder: Path, target: Path) -> Iterator[Path]:
         holder = Path(tempfile.mkdtemp(".partial", f".{target.name[:100]}.", folder))
     except OSError as error:
         raise InputError(
-            f"cannot write {target}: {error.strerror}; choose an output path in a folder that "
+            f"cannot write to {folder}: {error.strerror}; choose an output path in a folder that "
             "exists or can be made, and that you may write to."
         ) from error
     try:

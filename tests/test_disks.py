@@ -176,6 +176,6 @@ def test_the_command_names_the_disk(disk: Disk, tmp_path: Path) -> None:
     assert done.returncode == 2
     events = [json.loads(line) for line in done.stderr.splitlines()]
     assert [event["text"] for event in events if event["event"] == "error"] == [
-        f"cannot write {disk.folder}: No space left on device; free space or choose another "
-        "output path."
+        f"cannot write to {disk.folder}: No space left on device; free space or choose another "
+        "output folder."
     ]

@@ -7,11 +7,13 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 from pathlib import Path
 
 import pytest
 
 from cellquant.errors import InputError
+from cellquant.lock import only_writer
 from cellquant.storage import (
     RunRecord,
     atomic_path,
@@ -19,6 +21,7 @@ from cellquant.storage import (
     content_key,
     digest,
     disk_problem,
+    replace_together,
     write_json,
 )
 
@@ -115,6 +118,33 @@ def test_the_record_names_stages_and_inputs(tmp_path: Path) -> None:
     assert saved["stages"][0]["stage"] == "read"
     assert {"wall_s", "cpu_s"} <= set(saved["stages"][0])
     assert saved["machine"]["cores"] >= 1
+
+
+def test_results_that_belong_together_are_never_mixed(tmp_path: Path) -> None:
+    (tmp_path / ".together.killed.partial").mkdir()
+
+    def write(content: str) -> None:
+        with replace_together(tmp_path) as place:
+            for name in ("a", "b"):
+                (place / name).write_text(content)
+            (place / "run.json").write_text(content)
+
+    write("one")
+    with only_writer(tmp_path):
+        other = threading.Thread(target=write, args=("other",), daemon=True)
+        other.start()
+        write("two")  # the same thread may
+        other.join(timeout=0.3)
+        assert other.is_alive(), "another writer waits"
+        assert {p.read_text() for p in tmp_path.iterdir() if p.name != ".lock"} == {"two"}
+    other.join(timeout=30)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(
+        ("a", "b", "run.json"), "other"
+    )
+    with pytest.raises(RuntimeError, match="broke"), replace_together(tmp_path) as place:
+        (place / "a").write_text("half")
+        raise RuntimeError("broke")
+    assert {p.read_text() for p in tmp_path.iterdir()} == {"other"}
 
 
 def test_another_work_in_a_folder_is_removed_and_the_same_is_kept(tmp_path: Path) -> None:
