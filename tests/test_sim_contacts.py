@@ -276,7 +276,8 @@ def test_absent_terms_change_nothing(contact):
     state, radius, box = lively(plain)
     lean = velocity(Layer(plain, radius, box, contact=contact), state)
     full = velocity(Layer(plain, radius, box, contact=contact, general=True), state)
-    assert lean == pytest.approx(full, abs=1e-15)
+    # Guesses in single precision may round in another way; crossings are settled to 1e-9.
+    assert lean == pytest.approx(full, abs=1e-11)
     assert not lean[:, 2].any()
 
 

@@ -2,6 +2,7 @@
 
 from typing import Any, Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,13 +84,16 @@ class Layer:
         )
         size = outlines.samples_of(scene.modes) if contact == "exact" else points
         self._table, single = outlines.compass(scene.modes, size)
-        self._record = np.zeros((n_cells, outlines.HEAD + 2 * n_modes))
+        self._record = np.zeros((n_cells, outlines.record_length(n_modes)))
         self._energy = np.zeros(n_cells)
         if contact == "exact":
             self._single = single
+            self._work = crossings.work(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+            self._circle = np.zeros((size, 4))
+            self._circle[:, :2] = self._table[:2].T
             self._quarter, self._starts = outlines.quarter_points(scene.modes)
-            self._grid = np.zeros((n_cells, 3, 3 * size // 2), np.float32)
-            self._pattern = np.zeros((n_cells, 1 + 2 * n_modes), np.float32)
+            self._grid = np.zeros((n_cells, 3, outlines.row_of_samples(size)), np.float32)
+            self._pattern = np.zeros((n_cells, 1 + 4 * n_modes), np.float32)
             self._tangent = np.zeros((n_cells, 2 + 2 * n_modes))
         else:
             self._rho = np.zeros((n_cells, size))
@@ -143,6 +147,7 @@ class Layer:
                 self._torque,
                 out,
                 self._energy,
+                self._n_parts,
             )
         else:
             quadrature.quadrature_velocity(
@@ -198,6 +203,7 @@ class Layer:
         self._rebuild()
 
     def _prepare(self, state: Floats, tension: tuple[int, ...]) -> None:
+        self._n_parts = min(self._n_blocks, numba.get_num_threads())
         if self.scene.rigid:
             self._record[:, :2] = state[:, :2]
             self._record[:, 2:5] = self.radius[:, None]
@@ -214,6 +220,7 @@ class Layer:
                 self._grid,
                 self._pattern,
                 self._tangent,
+                self._n_parts,
             )
         else:
             quadrature.sample_contours(
@@ -293,27 +300,32 @@ class Layer:
         self._room = self._n_blocks * room
         self._roots = np.zeros((self._room + spare, crossings.ROOT))
         self._sign = np.zeros(self._room + spare)
+        self._of_blocks = self._roots[: self._room], self._sign[: self._room]
+        self._fault = np.zeros(self._n_blocks, np.int64)
 
     def _find_crossings(self) -> None:
         while True:
-            fault: Any = np.zeros(self._n_blocks, np.int64)
+            roots, sign = self._of_blocks
             crossings.crossings(
                 self._record,
                 self._grid,
                 self._pattern,
+                self._circle,
                 self._table,
                 self._first,
                 self._other,
                 self._shift,
                 self._modes,
-                self._roots[: self._room],
+                roots,
                 self._root_first,
                 self._root_last,
-                self._sign[: self._room],
+                sign,
                 self._inside,
-                fault,
+                self._fault,
+                *self._work,
+                self._n_parts,
             )
-            if fault.any():
+            if self._fault.any():
                 self._allocate_roots(2 * self._room // self._n_blocks)
             elif (used := self._close_pinches()) > len(self._roots):
                 self._allocate_roots(self._room // self._n_blocks, 2 * (used - self._room))

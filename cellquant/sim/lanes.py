@@ -1,64 +1,293 @@
-"""Memory and bits for loops that the compiler turns into vector instructions.
+"""Vectors of numbers, each one register, for compiled code: 8 singles or 4 doubles.
 
-Inner loops run over `LANES` entries with an unsigned index (a sign would need a branch) and write
-to the stack only: of anything else the compiler cannot know that it is apart from what is read.
+A kernel that works on several cells, samples or crossings at once says so: it loads vectors, adds
+and multiplies them, and stores them again. Nothing is left to the compiler's guess whether a loop
+may become vector instructions, and the result does not depend on it.
+
+A pair of registers may be one vector as well (`load_pair` and so on): the operations on one then
+fill the waits of the other, which long chains of operations need.
+
+Arithmetic between vectors and plain numbers spreads the number over all lanes. Comparisons give
+masks, for `choose` and `bits`. Arrays are read and written at a flat index, contiguous and without
+a check of bounds.
 """
 
+import operator
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
-LANES = 8
+LANES = 8  # singles in a vector, and cells of a tile
+QUAD = 4  # doubles in a vector
+CONTRACT = ("contract", "nsz")  # products and sums may be fused; nothing else is reordered
+LOOSE = ("contract", "nsz", "arcp", "afn", "reassoc", "nnan", "ninf")
 
 
-def _stack(kind: Any, native: Any) -> Any:
-    def room(_: Any, modes: Any, fixed: Any, per_mode: Any) -> Any:
-        size = LANES * (fixed.literal_value + per_mode.literal_value * len(modes))
+class Vector(types.Type):
+    """Numbers of one kind in a register; of booleans a mask."""
+
+    def __init__(self, kind: Any, lanes: int) -> None:
+        self.kind = kind
+        self.lanes = lanes
+        super().__init__(name=f"Vector({kind}, {lanes})")
+
+    @property
+    def native(self) -> Any:
+        """The type of the compiler."""
+        return ir.VectorType(NATIVE[self.kind], self.lanes)
+
+
+NATIVE = {
+    types.float64: ir.DoubleType(),
+    types.float32: ir.FloatType(),
+    types.boolean: ir.IntType(1),
+}
+DOUBLES, SINGLES = Vector(types.float64, QUAD), Vector(types.float32, LANES)
+PAIRS = {kind: Vector(kind.kind, 2 * kind.lanes) for kind in (DOUBLES, SINGLES)}
+
+
+@register_model(Vector)
+class VectorModel(models.PrimitiveModel):
+    """A vector is an LLVM vector."""
+
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, kind.native)  # type: ignore[no-untyped-call]
+
+
+def _common(a: Any, b: Any) -> Any:
+    """Type of a vector with a vector or a number, or None."""
+    if isinstance(a, Vector) and isinstance(b, Vector):
+        return a if a == b else None
+    if isinstance(a, Vector) and isinstance(b, types.Number) and a.kind is not types.boolean:
+        return a
+    if isinstance(b, Vector) and isinstance(a, types.Number) and b.kind is not types.boolean:
+        return b
+    return None
+
+
+def _spread(context: Any, builder: Any, value: Any, kind: Any, vector: Any) -> Any:
+    """The same number in every lane; vectors stay what they are."""
+    if isinstance(kind, Vector):
+        return value
+    value = context.cast(builder, value, kind, vector.kind)
+    undefined = ir.Constant(vector.native, ir.Undefined)
+    one = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
+    return _shuffle(builder, one, undefined, [0] * vector.lanes)
+
+
+def _shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
+    places = ir.Constant(ir.VectorType(ir.IntType(32), len(order)), order)
+    return builder.shuffle_vector(a, b, places)
+
+
+def _define(op: Any, generate: Callable[..., Any], *, mask: bool = False) -> None:
+    """Teach the compiler a binary operator between vectors and numbers."""
+
+    @type_callable(op)
+    def typed(context: Any) -> Any:
+        def typer(a: Any, b: Any) -> Any:
+            common = _common(a, b)
+            return Vector(types.boolean, common.lanes) if mask and common is not None else common
+
+        return typer
+
+    def lower(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        common = _common(*signature.args)
+        a, b = (
+            _spread(context, builder, value, kind, common)
+            for value, kind in zip(args, signature.args, strict=True)
+        )
+        return generate(builder, a, b)
+
+    for pair in ((Vector, Vector), (Vector, types.Number), (types.Number, Vector)):
+        lower_builtin(op, *pair)(lower)  # type: ignore[no-untyped-call]
+
+
+for ops, name in (
+    ((operator.add, operator.iadd), "fadd"),
+    ((operator.sub, operator.isub), "fsub"),
+    ((operator.mul, operator.imul), "fmul"),
+    ((operator.truediv, operator.itruediv), "fdiv"),
+):
+    for op in ops:
+        _define(op, lambda builder, a, b, name=name: getattr(builder, name)(a, b, flags=CONTRACT))
+for op, sign in (
+    (operator.gt, ">"), (operator.ge, ">="), (operator.lt, "<"), (operator.le, "<="),
+    (operator.ne, "!="), (operator.eq, "=="),
+):  # fmt: skip
+    _define(op, lambda builder, a, b, sign=sign: _compare(builder, sign, a, b), mask=True)
+for op, name in ((operator.and_, "and_"), (operator.or_, "or_"), (operator.xor, "xor")):
+    _define(op, lambda builder, a, b, name=name: getattr(builder, name)(a, b))
+
+
+def _compare(builder: Any, sign: str, a: Any, b: Any) -> Any:
+    if a.type.element == ir.IntType(1):
+        return builder.xor(a, b) if sign == "!=" else builder.icmp_unsigned(sign, a, b)
+    return builder.fcmp_ordered(sign, a, b)
+
+
+@type_callable(operator.neg)
+def _typed_neg(context: Any) -> Any:
+    return lambda a: a if isinstance(a, Vector) and a.kind is not types.boolean else None
+
+
+@lower_builtin(operator.neg, Vector)  # type: ignore[no-untyped-call]
+def _neg(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    return builder.fneg(args[0], flags=CONTRACT)
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, at: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.gep(data, [at])
+
+
+def _kind_of(array: Any) -> Any:
+    kinds = {types.float64: DOUBLES, types.float32: SINGLES}
+    return kinds.get(array.dtype) if isinstance(array, types.Array) else None
+
+
+def _loader(pair: bool) -> Any:
+    def load(_: Any, array: Any, at: Any) -> Any:
+        """The numbers from a flat index of an array on."""
+        kind = PAIRS[_kind_of(array)] if pair else _kind_of(array)
 
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            place = cgutils.alloca_once(builder, native, ir.Constant(ir.IntType(64), size))  # type: ignore[no-untyped-call]
-            place.align = 64
-            return place
+            place = _pointer(context, builder, signature.args[0], args[0], args[1])
+            size = NATIVE[kind.kind].get_abi_size(context.target_data)
+            return builder.load(builder.bitcast(place, kind.native.as_pointer()), align=size)
 
-        pointer = types.CPointer(kind)  # type: ignore[no-untyped-call]
-        return pointer(modes, fixed, per_mode), generate
+        return kind(array, types.intp), generate
 
-    room.__doc__ = f"Stack for (fixed + per_mode len(modes)) LANES numbers of type {kind}."
-    return intrinsic(prefer_literal=True)(room)
+    return intrinsic(load)
 
 
-def _cast(source: Any, target: Any, native: Any) -> Any:
-    def cast(_: Any, x: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return builder.bitcast(args[0], native)
-
-        return target(source), generate
-
-    cast.__doc__ = f"Read the bits of a {source} as a {target}."
-    return intrinsic(cast)
-
-
-doubles = _stack(types.float64, ir.DoubleType())
-singles = _stack(types.float32, ir.FloatType())
-integers = _stack(types.int32, ir.IntType(32))
-words = _stack(types.uint64, ir.IntType(64))
-bits_of_double = _cast(types.float64, types.uint64, ir.IntType(64))
-double_of_bits = _cast(types.uint64, types.float64, ir.DoubleType())
-bits_of_single = _cast(types.float32, types.int32, ir.IntType(32))
-single_of_bits = _cast(types.int32, types.float32, ir.FloatType())
-
-
-def _bytes_of(_: Any, place: Any) -> Any:
-    """Point to the single bytes of words on the stack."""
+def _store(_: Any, array: Any, at: Any, vector: Any) -> Any:
+    """Put a vector at a flat index of an array."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(args[0], ir.IntType(8).as_pointer())
+        place = _pointer(context, builder, signature.args[0], args[0], args[1])
+        size = NATIVE[vector.kind].get_abi_size(context.target_data)
+        place = builder.bitcast(place, args[2].type.as_pointer())
+        builder.store(args[2], place, align=size)
+        return context.get_dummy_value()
 
-    pointer = types.CPointer(types.uint8)  # type: ignore[no-untyped-call]
-    return pointer(place), generate
+    return types.void(array, types.intp, vector), generate
+
+
+def _choose(_: Any, mask: Any, a: Any, b: Any) -> Any:
+    """Lane by lane a where the mask is true, else b."""
+    common = _common(a, b)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        a_, b_ = (
+            _spread(context, builder, value, kind, common)
+            for value, kind in zip(args[1:], signature.args[1:], strict=True)
+        )
+        return builder.select(args[0], a_, b_)
+
+    return common(mask, a, b), generate
+
+
+def _extreme(sign: str) -> Any:
+    def extreme(_: Any, a: Any, b: Any) -> Any:
+        common = _common(a, b)
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            a_, b_ = (
+                _spread(context, builder, value, kind, common)
+                for value, kind in zip(args, signature.args, strict=True)
+            )
+            return builder.select(builder.fcmp_ordered(sign, a_, b_), a_, b_)
+
+        return common(a, b), generate
+
+    extreme.__doc__ = f"Lane by lane a where a {sign} b, else b."
+    return intrinsic(extreme)
+
+
+def _call(name: str, flags: tuple[str, ...] = CONTRACT) -> Any:
+    def function(_: Any, a: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            native = args[0].type
+            suffix = f"v{a.lanes}f{64 if a.kind is types.float64 else 32}"
+            kind = ir.FunctionType(native, [native])
+            callee = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+                builder.module, kind, f"llvm.{name}.{suffix}"
+            )
+            return builder.call(callee, args, fastmath=flags)
+
+        return a(a), generate
+
+    function.__doc__ = f"The {name} of every lane."
+    return intrinsic(function)
+
+
+def _rough_root(_: Any, a: Any) -> Any:
+    """1 / sqrt of every lane, in single precision, positive and finite, to about 1e-7."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        native = args[0].type
+        callee = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module, ir.FunctionType(native, [native]), f"llvm.sqrt.v{a.lanes}f32"
+        )
+        root = builder.call(callee, args, fastmath=LOOSE)
+        return builder.fdiv(ir.Constant(native, [1.0] * a.lanes), root, flags=LOOSE)
+
+    return a(a) if a.kind is types.float32 else None, generate
+
+
+def _halved_bits(_: Any, a: Any, constant: Any) -> Any:
+    """Take half the bits of every lane, as a whole number, from a constant."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        whole = ir.VectorType(ir.IntType(64), QUAD)
+        halves = builder.lshr(builder.bitcast(args[0], whole), ir.Constant(whole, [1] * QUAD))
+        number = ir.Constant(whole, [constant.literal_value] * QUAD)
+        return builder.bitcast(builder.sub(number, halves), args[0].type)
+
+    return a(a, constant) if a == DOUBLES else None, generate
+
+
+def _widener(pair: bool) -> Any:
+    kind = PAIRS[DOUBLES] if pair else DOUBLES
+
+    def widen(_: Any, array: Any, at: Any) -> Any:
+        """Doubles from a flat index of an array of singles on."""
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            place = _pointer(context, builder, signature.args[0], args[0], args[1])
+            narrow = ir.VectorType(ir.FloatType(), kind.lanes)
+            value = builder.load(builder.bitcast(place, narrow.as_pointer()), align=4)
+            return builder.fpext(value, kind.native)
+
+        return kind(array, types.intp) if _kind_of(array) == SINGLES else None, generate
+
+    return intrinsic(widen)
+
+
+def _spreader(kind: Any) -> Any:
+    def spread(_: Any, x: Any) -> Any:
+        """A number in all lanes."""
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return _spread(context, builder, args[0], signature.args[0], kind)
+
+        return kind(x), generate
+
+    return intrinsic(spread)
+
+
+def _bits(_: Any, mask: Any) -> Any:
+    """A mask as the low bits of a number, lane 0 the lowest."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.zext(builder.bitcast(args[0], ir.IntType(mask.lanes)), ir.IntType(64))
+
+    return types.uint64(mask), generate
 
 
 def _trailing_zeros(_: Any, word: Any) -> Any:
@@ -67,8 +296,92 @@ def _trailing_zeros(_: Any, word: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
-    return types.uint64(types.uint64), generate
+    return types.intp(types.uint64), generate
 
 
-bytes_of: Any = intrinsic(_bytes_of)
+def _transpose(builder: Any, a: Any, b: Any, c: Any, d: Any) -> list[Any]:
+    ab = [_shuffle(builder, a, b, order) for order in ([0, 4, 2, 6], [1, 5, 3, 7])]
+    cd = [_shuffle(builder, c, d, order) for order in ([0, 4, 2, 6], [1, 5, 3, 7])]
+    return [
+        _shuffle(builder, ab[number % 2], cd[number % 2], order)
+        for number, order in enumerate(([0, 1, 4, 5],) * 2 + ([2, 3, 6, 7],) * 2)
+    ]
+
+
+def _scatter(_: Any, array: Any, at: Any, stride: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Put lane r of four vectors of doubles side by side, at the flat index at + r stride."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place, step = args[1:3]
+        for first in range(0, a.lanes, 4):
+            order = list(range(first, first + 4))
+            quads = [_shuffle(builder, vector, vector, order) for vector in args[3:]]
+            for vector in _transpose(builder, *quads):
+                if array.dtype is types.float32:
+                    vector = builder.fptrunc(vector, ir.VectorType(ir.FloatType(), 4))
+                pointer = _pointer(context, builder, signature.args[0], args[0], place)
+                builder.store(vector, builder.bitcast(pointer, vector.type.as_pointer()), align=4)
+                place = builder.add(place, step)
+        return context.get_dummy_value()
+
+    known = a.kind is types.float64
+    return types.void(array, types.intp, types.intp, a, b, c, d) if known else None, generate
+
+
+def _gatherer(pair: bool) -> Any:
+    def gather(_: Any, array: Any, rows: Any, at: Any, plus: Any) -> Any:
+        """Four vectors: the numbers at rows[at + lane] + plus + 0 .. 3 of an array.
+
+        Every lane reads four neighbouring numbers at once; the lanes are then transposed.
+        """
+        kind = PAIRS[_kind_of(array)] if pair else _kind_of(array)
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            native = NATIVE[kind.kind]
+            four = ir.VectorType(native, 4)
+            size = native.get_abi_size(context.target_data)
+            quads = []
+            for lane in range(kind.lanes):
+                place = builder.add(args[2], ir.Constant(args[2].type, lane))
+                row = builder.load(_pointer(context, builder, signature.args[1], args[1], place))
+                row = builder.add(row, args[3])
+                pointer = _pointer(context, builder, signature.args[0], args[0], row)
+                quads.append(builder.load(builder.bitcast(pointer, four.as_pointer()), align=size))
+            parts = [
+                _transpose(builder, *quads[first : first + 4]) for first in range(0, kind.lanes, 4)
+            ]
+            while len(parts) > 1:
+                order = list(range(2 * parts[0][0].type.count))
+                parts = [
+                    [_shuffle(builder, x, y, order) for x, y in zip(*two, strict=True)]
+                    for two in zip(parts[::2], parts[1::2], strict=True)
+                ]
+            return context.make_tuple(builder, signature.return_type, parts[0])
+
+        result = types.UniTuple(kind, 4)  # type: ignore[no-untyped-call]
+        return result(array, rows, types.intp, types.intp), generate
+
+    return intrinsic(gather)
+
+
+load: Any = _loader(False)
+load_pair: Any = _loader(True)
+store: Any = intrinsic(_store)
+gather: Any = _gatherer(False)
+gather_pair: Any = _gatherer(True)
+scatter: Any = intrinsic(_scatter)
+choose: Any = intrinsic(_choose)
+least: Any = _extreme("<")
+greatest: Any = _extreme(">")
+root: Any = _call("sqrt")
+absolute: Any = _call("fabs")
+floor: Any = _call("floor")
+ceiling: Any = _call("ceil")
+rough_root: Any = intrinsic(_rough_root)
+halved_bits: Any = intrinsic(prefer_literal=True)(_halved_bits)
+widen_pair: Any = _widener(True)
+doubles: Any = _spreader(DOUBLES)
+singles: Any = _spreader(SINGLES)
+singles_pair: Any = _spreader(PAIRS[SINGLES])
+bits: Any = intrinsic(_bits)
 trailing_zeros: Any = intrinsic(_trailing_zeros)

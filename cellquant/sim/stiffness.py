@@ -23,6 +23,17 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from cellquant.sim.contacts import Layer
+from cellquant.sim.crossings import ROOT
+from cellquant.sim.lanes import (
+    LANES,
+    absolute,
+    gather_pair,
+    greatest,
+    load_pair,
+    root,
+    scatter,
+    store,
+)
 from cellquant.sim.outlines import HEAD
 
 Floats = NDArray[np.float64]
@@ -31,7 +42,6 @@ CG_MOST = 200
 LEAST_SINE = 0.05  # smaller angles, of grazing contacts, would only cost iterations
 FLAGS = {"contract", "reassoc", "nsz", "arcp"}
 LOOSE = ("contract", "reassoc", "nsz")  # NaN stays what it is
-LANES = 8  # numbers of single precision in a vector register
 
 
 def row_length(n_modes: int) -> int:
@@ -40,78 +50,119 @@ def row_length(n_modes: int) -> int:
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def normal_displacement(
-    radius: Any, record: Any, i: int, c: float, s: float, rho: float, scale: Any, modes: Any,
-    weight: Any, row: int, offset: int,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Write u times `scale` into a row; return the unit tangent and the square of what it wrote."""
-    slope = 0.0
-    zr = c
-    zi = s
-    for m in range(len(modes)):
-        zr, zi = zr * c - zi * s, zr * s + zi * c
-        slope -= (m + 2) * (record[i, HEAD + m] * zi + record[i, HEAD + len(modes) + m] * zr)
-    tx = slope * c - rho * s
-    ty = slope * s + rho * c
-    inverse = 1.0 / math.sqrt(max(tx * tx + ty * ty, 1e-24))
-    tx *= inverse
-    ty *= inverse
-    turning = -rho * slope * inverse * scale[2]
-    weight[row, offset] = ty * scale[0]
-    weight[row, offset + 1] = -tx * scale[1]
-    weight[row, offset + 2] = turning
-    square = scale[0] * scale[0] + turning * turning
-    if len(modes) > 0:
-        radial = radius[i] * rho * inverse * scale[3]
-        half = 0.5 / record[i, 2]
-        zr = c
-        zi = s
-        for m in range(len(modes)):
-            zr, zi = zr * c - zi * s, zr * s + zi * c
-            along = radial * (zr - half * record[i, HEAD + m])
-            across = radial * (zi + half * record[i, HEAD + len(modes) + m])
-            weight[row, offset + 3 + m] = along
-            weight[row, offset + 3 + len(modes) + m] = across
-            square += along * along + across * across
-    return tx, ty, square
+def list_crossings(
+    first: Any, other: Any, root_first: Any, root_last: Any, roots: Any, stride: int, rows: Any,
+    cells: Any,
+) -> int:  # fmt: skip
+    """List where the numbers of every crossing, of its i and of its j begin; return how many.
 
-
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
-def gather(
-    radius: Any, record: Any, first: Any, other: Any, root_first: Any, root_last: Any, roots: Any,
-    scale: Any, k: float, modes: Any, weight: Any, factor: Any, cells: Any,
-) -> tuple[int, float]:  # fmt: skip
-    """Collect w and k / sin(psi) of all crossings.
-
-    Returns their number (where it exceeds the room, the rest is not stored), and the mean
-    stiffness 2 k |w|^2 / sin(psi) of a contact with two of them, per time.
+    Where that exceeds the room, the rest is not stored.
     """
-    room = weight.shape[0]
-    width = weight.shape[1] // 2
     count = 0
-    total = 0.0
-    for i in range(radius.shape[0]):
+    for i in range(first.shape[0] - 1):
         for p in range(first[i], first[i + 1]):
             for r in range(root_first[p], root_last[p]):
                 if roots[r, 4] == 0.0 or roots[r, 5] == 0.0:
                     continue  # an arc that ends at the centre of a pinched cell, no crossing
-                if count < room:
-                    j = other[p]
-                    ax, ay, square_i = normal_displacement(
-                        radius, record, i, roots[r, 0], roots[r, 1], roots[r, 4], scale, modes,
-                        weight, count, 0,
-                    )  # fmt: skip
-                    bx, by, square_j = normal_displacement(
-                        radius, record, j, roots[r, 2], roots[r, 3], roots[r, 5], scale, modes,
-                        weight, count, width,
-                    )  # fmt: skip
-                    rigidity = k / max(abs(ax * by - ay * bx), LEAST_SINE)
-                    factor[count] = rigidity
+                if count < cells.shape[0]:
+                    rows[0, count] = stride * i
+                    rows[1, count] = stride * other[p]
+                    rows[2, count] = ROOT * r
                     cells[count, 0] = i
-                    cells[count, 1] = j
-                    total += 2.0 * rigidity * (square_i + square_j)
+                    cells[count, 1] = other[p]
                 count += 1
-    return count, total / max(1, count)
+    return count
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def gather(
+    record: Any, first: Any, other: Any, root_first: Any, root_last: Any, roots: Any,
+    scale: Any, k: float, modes: Any, rows: Any, weight: Any, factor: Any, cells: Any,
+) -> tuple[int, float]:  # fmt: skip
+    """Collect w and k / sin(psi) of all crossings.
+
+    Returns their number (where it exceeds the room, nothing is stored), and the mean stiffness
+    2 k |w|^2 / sin(psi) of a contact with two of them, per time.
+    """
+    n_modes = len(modes)
+    width = weight.shape[1] // 2
+    room = rows.shape[1]
+    count = list_crossings(first, other, root_first, root_last, roots, record.shape[1], rows, cells)
+    if count == 0 or count > cells.shape[0]:
+        return count, 0.0
+    padded = (count + LANES - 1) // LANES * LANES
+    for r in range(count, padded):
+        for row in range(3):
+            rows[row, r] = rows[row, count - 1]
+    real = np.empty((2 * n_modes + 4) * LANES)
+    imaginary = real[n_modes * LANES :]
+    column = np.zeros(width * LANES)
+    share = np.empty(LANES)
+    total = 0.0
+    for r in range(0, padded, LANES):
+        c, s, c_2, s_2 = gather_pair(roots, rows, 2 * room + r, 0)
+        rho, rho_2, _, _ = gather_pair(roots, rows, 2 * room + r, 4)
+        ax = c
+        ay = c
+        squares = c
+        for side in range(2):
+            if side == 1:
+                c, s, rho = c_2, s_2, rho_2
+            at = side * room + r
+            _, _, mean, _ = gather_pair(record, rows, at, 0)
+            _, _, _, radius = gather_pair(record, rows, at, 4)
+            for m in range(0, 2 * n_modes, 4):
+                v0, v1, v2, v3 = gather_pair(record, rows, at, HEAD + m)
+                store(real, m * LANES, v0)
+                store(real, (m + 1) * LANES, v1)
+                store(real, (m + 2) * LANES, v2)
+                store(real, (m + 3) * LANES, v3)
+            slope = 0.0 * c
+            zr = c
+            zi = s
+            for m in range(n_modes):
+                zr, zi = zr * c - zi * s, zr * s + zi * c
+                turned = load_pair(real, m * LANES) * zi + load_pair(imaginary, m * LANES) * zr
+                slope -= (m + 2.0) * turned
+            tx = slope * c - rho * s
+            ty = slope * s + rho * c
+            inverse = 1.0 / root(greatest(tx * tx + ty * ty, 1e-24))
+            tx *= inverse
+            ty *= inverse
+            turning = -rho * slope * inverse * scale[2]
+            store(column, 0, ty * scale[0])
+            store(column, LANES, -tx * scale[1])
+            store(column, 2 * LANES, turning)
+            square = scale[0] * scale[0] + turning * turning
+            if n_modes > 0:
+                radial = radius * rho * inverse * scale[3]
+                half = 0.5 / mean
+                zr = c
+                zi = s
+                for m in range(n_modes):
+                    zr, zi = zr * c - zi * s, zr * s + zi * c
+                    along = radial * (zr - half * load_pair(real, m * LANES))
+                    across = radial * (zi + half * load_pair(imaginary, m * LANES))
+                    store(column, (3 + m) * LANES, along)
+                    store(column, (3 + n_modes + m) * LANES, across)
+                    square += along * along + across * across
+            for q in range(0, width, 4):
+                scatter(
+                    weight, r * 2 * width + side * width + q, 2 * width,
+                    load_pair(column, q * LANES), load_pair(column, (q + 1) * LANES),
+                    load_pair(column, (q + 2) * LANES), load_pair(column, (q + 3) * LANES),
+                )  # fmt: skip
+            if side == 0:
+                ax, ay, squares = tx, ty, square
+                continue
+            rigidity = k / greatest(absolute(ax * ty - ay * tx), LEAST_SINE)
+            store(share, 0, rigidity)
+            for lane in range(LANES):
+                factor[r + lane] = share[lane]
+            store(share, 0, 2.0 * rigidity * (squares + square))
+            for lane in range(min(LANES, count - r)):
+                total += share[lane]
+    return count, total / count
 
 
 @intrinsic
@@ -316,10 +367,11 @@ class StiffPart:
         """Take the crossings of the state that the layer evaluated last."""
         while True:
             self._count, self.mean = gather(
-                self._layer.radius, *self._layer.crossings, self._scale,  # type: ignore[call-arg]
-                self._layer.scene.k, self._modes, self._weight, self._factor, self._cells,
+                *self._layer.crossings, self._scale,  # type: ignore[call-arg]
+                self._layer.scene.k, self._modes, self._rows, self._weight, self._factor,
+                self._cells,
             )  # fmt: skip
-            if self._count <= len(self._factor):
+            if self._count <= len(self._cells):
                 return
             self._allocate(self._count + self._count // 4)
 
@@ -337,6 +389,7 @@ class StiffPart:
         )  # fmt: skip
 
     def _allocate(self, room: int) -> None:
-        self._weight = np.zeros((room, 2 * self._width), np.float32)
-        self._factor = np.empty(room, np.float32)
+        self._rows = np.zeros((3, room + LANES), np.int64)
+        self._weight = np.zeros((room + LANES, 2 * self._width), np.float32)
+        self._factor = np.empty(room + LANES, np.float32)
         self._cells = np.empty((room, 2), np.int64)
