@@ -121,6 +121,7 @@ def _track_and_observe(task: Task, folder: Path) -> None:
     from cellquant.compare.report import experiment_report
     from cellquant.io import read_images, read_labels
     from cellquant.pipeline import observe_into, track_movie
+    from cellquant.rows import scan_tracks
     from cellquant.tables import read_cells, read_tracks
 
     calibration = task["calibration"]
@@ -140,9 +141,8 @@ def _track_and_observe(task: Task, folder: Path) -> None:
         record = RunRecord.from_dict(done)
         _keep_tracks_only(folder, record)
     # From the disk in either case, so that a resumed stack gives the same bytes.
-    cells, tracks = read_cells(folder), read_tracks(folder)
     observables = observe_into(
-        tracks,
+        scan_tracks(folder),
         folder,
         record,
         options={
@@ -156,13 +156,13 @@ def _track_and_observe(task: Task, folder: Path) -> None:
     with record.stage("report"):
         experiment_report(
             title=f"{task['condition']}, {task['trial']}, {task['name']}",
-            tracks=tracks,
+            tracks=read_tracks(folder),
             observables=observables,
             settings=record.as_dict(),
             out=folder / "report.html",
             stack=masks,
             raw=raw,
-            cells=cells,
+            cells=read_cells(folder),
         )
     record.write(folder)
 

@@ -1,5 +1,6 @@
 """What several observables share, each made once and only when an observable asks for it."""
 
+import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -14,8 +15,10 @@ from cellquant.observables.windows import (
     WINDOW_POINTS,
     Census,
     Window,
+    bin_density,
     count_by_frame,
     density_per_frame,
+    density_scale,
     diameter_by_frame,
     split_frames,
     usable_area,
@@ -206,6 +209,47 @@ class Context:
             n = float(count[first:last].sum())
             found.append(float(total[first:last].sum()) / n if n else float("nan"))
         return found
+
+    @cached_property
+    def window_densities(self) -> list[float]:
+        """Mean density in each window, in the unit of the density bins where they apply."""
+        factor, _ = density_scale(self.head.units) or (1.0, "")
+        frame = self.per_frame["frame"].to_numpy()
+        density = self.per_frame["density"].to_numpy()
+        found = []
+        for window in self.windows:
+            first, last = np.searchsorted(frame, (window.start, window.stop))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # no area in any frame
+                found.append(float(np.nanmean(density[first:last])) * factor)
+        return found
+
+    @cached_property
+    def window_bins(self) -> list[float | None]:
+        """Centre of the density bin of each window; None outside every bin."""
+        if density_scale(self.head.units) is None:
+            return [None] * len(self.windows)
+        centres, width = self.settings.bin_centres, self.settings.bin_width
+        return [bin_density(d, centres=centres, width=width) for d in self.window_densities]
+
+    @cached_property
+    def no_bin(self) -> str | None:
+        """Why no window lies in a density bin; None when one does."""
+        if density_scale(self.head.units) is None:
+            return "density bins are in cells/mm^2 and need lengths in um"
+        if not self.windows:
+            return (
+                f"the movie has {self.n_frames} frames, fewer than the {self.window_points} of a "
+                "window"
+            )
+        if any(centre is not None for centre in self.window_bins):
+            return None
+        low, high = min(self.window_densities), max(self.window_densities)
+        width, centres = self.settings.bin_width, self.settings.bin_centres
+        return (
+            f"the windows have densities of {low:.4g} to {high:.4g} 1/mm^2, all outside the bins "
+            f"from {min(centres) - width / 2:g} to {max(centres) + width / 2:g}"
+        )
 
     @cached_property
     def structure(self) -> Any:

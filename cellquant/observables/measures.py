@@ -52,17 +52,47 @@ def density(context: Context, out: Results) -> None:
 
 
 def _distribution(context: Context, out: Results, name: str) -> None:
+    first, points = context.frame_range[0], context.window_points
+    numbers = [np.empty(0, dtype=np.int64)]
+
     def of_piece(piece: Piece) -> Any:
         used = ~piece["touches_border"] & np.isfinite(piece["shape_index"])
         used &= np.isfinite(piece[name])
+        numbers.append(((piece["frame"][used] - first) // points).astype(np.int32))
         return used, piece[name][used]
 
-    columns = ("shape_index", name, "touches_border")
-    found = describe(*pooled(context.source, columns, of_piece))
+    columns = ("frame", "shape_index", name, "touches_border")
+    values, blocks = pooled(context.source, columns, of_piece)
+    found = describe(values, blocks)
     out.summary[name] = {**found.summary, "border_rule": BORDER_RULE}
     if not found.summary["n"]:
         out.summary[name]["reason"] = "no cell away from the border has a measured contour"
     out.tables[name] = found.table.rename(columns={"value": name, "density": "value"})
+    if context.no_bin:
+        out.summary[name].update(by_bin=[], by_bin_reason=context.no_bin)
+    else:
+        entries, table = _by_bin(context, name, values, blocks, np.concatenate(numbers))
+        out.summary[name]["by_bin"] = entries
+        out.tables[f"{name}_by_bin"] = table
+
+
+def _by_bin(
+    context: Context, name: str, values: Any, blocks: Blocks, window: Any
+) -> tuple[list[dict[str, Any]], pd.DataFrame]:
+    """The distribution in the windows of each density bin."""
+    entries, tables = [], []
+    bins = context.window_bins
+    for centre in sorted({c for c in bins if c is not None}):
+        members = [number for number, c in enumerate(bins) if c == centre]
+        used = np.isin(window, members)
+        found = describe(values[used], Blocks(blocks.index[used], blocks.n, blocks.method))
+        density = float(np.mean([context.window_densities[number] for number in members]))
+        entry = {"bin_centre": centre, "density": density, "density_unit": "1/mm^2"}
+        entries.append({**entry, "n_windows": len(members), **found.summary})
+        table = found.table.rename(columns={"value": name, "density": "value"})
+        table.insert(0, "bin_centre", centre)
+        tables.append(table)
+    return entries, pd.concat(tables, ignore_index=True)
 
 
 def shape_index(context: Context, out: Results) -> None:

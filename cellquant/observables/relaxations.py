@@ -7,7 +7,7 @@ import pandas as pd
 
 from cellquant.observables.context import Context
 from cellquant.observables.measures import Results
-from cellquant.observables.windows import bin_density, density_scale
+from cellquant.observables.windows import density_scale
 
 _SCATTERING_COLUMNS = (
     "lag_time", "value", "std_error", "n_pairs", "scope", "window", "bin_centre", "q",
@@ -97,22 +97,17 @@ def windows(context: Context, out: Results) -> None:
     from cellquant.observables.relaxation import relaxation_time
 
     scale = density_scale(context.head.units)
-    factor, unit = scale or (1.0, f"1/{context.head.units.length}^2")
-    per_frame = context.per_frame
+    _, unit = scale or (1.0, f"1/{context.head.units.length}^2")
     curves: list[pd.DataFrame] = []
     entries: list[dict[str, Any]] = []
     binned: dict[float, list[tuple[dict[str, Any], LagAverage]]] = {}
     for number, window in enumerate(context.windows):
-        entry = _window_entry(context, number, per_frame, factor)
+        entry = _window_entry(context, number)
         entry.update(number=number, density_unit=unit, bin_centre=None)
         if scale is None:
             entry["bin_reason"] = "density bins are in cells/mm^2 and need lengths in um"
         else:
-            entry["bin_centre"] = bin_density(
-                entry["density"],
-                centres=context.settings.bin_centres,
-                width=context.settings.bin_width,
-            )
+            entry["bin_centre"] = context.window_bins[number]
             if entry["bin_centre"] is None:
                 entry["bin_reason"] = "the density is outside every bin"
         reason = context.no_motion or entry.pop("q_reason", None)
@@ -154,28 +149,14 @@ def windows(context: Context, out: Results) -> None:
 
 
 def _why_no_window(context: Context, entries: list[dict[str, Any]]) -> str:
-    """Why no window gives a relaxation time in a density bin."""
-    if not entries:
-        return (
-            f"the movie has {context.n_frames} frames, fewer than the {context.window_points} of "
-            "a window"
-        )
+    """Why no window gives a relaxation time."""
     reasons = list(dict.fromkeys(e["reason"] for e in entries if e.get("reason")))
-    if reasons:
-        return "; ".join(reasons)
-    low, high = (f(e["density"] for e in entries) for f in (min, max))
-    width, centres = context.settings.bin_width, context.settings.bin_centres
-    return (
-        f"the windows have densities of {low:.4g} to {high:.4g} {entries[0]['density_unit']}, all "
-        f"outside the bins from {min(centres) - width / 2:g} to {max(centres) + width / 2:g}"
-    )
+    return "; ".join(reasons) or context.no_bin or "no window has a relaxation time"
 
 
-def _window_entry(
-    context: Context, number: int, per_frame: pd.DataFrame, factor: float
-) -> dict[str, Any]:
+def _window_entry(context: Context, number: int) -> dict[str, Any]:
     window = context.windows[number]
-    inside = per_frame["frame"].between(window.start, window.stop - 1)
+    inside = context.per_frame["frame"].between(window.start, window.stop - 1)
     dt = context.tracks.frame_interval
     d = context.window_diameters[number]
     entry: dict[str, Any] = {
@@ -183,8 +164,8 @@ def _window_entry(
         "stop": window.stop * dt,
         "start_frame": window.start,
         "stop_frame": window.stop,
-        "density": float(per_frame["density"][inside].mean() * factor),
-        "n_cells_mean": float(per_frame["n_cells"][inside].mean()),
+        "density": context.window_densities[number],
+        "n_cells_mean": float(context.per_frame["n_cells"][inside].mean()),
         "mean_diameter": d,
         "q": None,
     }
