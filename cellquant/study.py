@@ -27,8 +27,8 @@ MAX_CURVES = 6
 def write_study(
     folder: Path, tasks: Sequence[Mapping[str, Any]], record: Mapping[str, Any]
 ) -> None:
-    """Write a study's ``stacks.parquet``, ``relaxation_times.parquet``, ``trial_values.parquet``,
-    ``statistics.json`` and report.
+    """Write a study's ``stacks.parquet``, ``shape_by_bin.parquet``, ``relaxation_times.parquet``,
+    ``trial_values.parquet``, ``statistics.json`` and report.
 
     Parameters
     ----------
@@ -50,6 +50,8 @@ def write_study(
     stacks = stack_table(tasks, results)
     with atomic_path(folder / "stacks.parquet") as path:
         write_table(stacks, path, units=units)
+    with atomic_path(folder / "shape_by_bin.parquet") as path:
+        write_table(shape_by_bin(tasks, results), path, units=units)
     times = relaxation_times(tasks)
     if times is None:  # nor may those of another configuration stay
         for name in ("relaxation_times.parquet", "trial_values.parquet", "statistics.json"):
@@ -90,6 +92,36 @@ def stack_table(tasks: Sequence[Mapping[str, Any]], results: "Sequence[Result]")
     table = pd.DataFrame(rows)
     numbers = [name for name in table.columns if name not in {"condition", "trial", "stack"}]
     return table.astype(dict.fromkeys(numbers, "float64")).astype({"n_frames": "int64"})
+
+
+def shape_by_bin(tasks: Sequence[Mapping[str, Any]], results: "Sequence[Result]") -> "pd.DataFrame":
+    """Shape index of each stack in each density bin that its windows fall into.
+
+    Returns
+    -------
+    pandas.DataFrame
+        condition, trial, stack, bin_centre, density, mean, median, mode, std and skewness with
+        their standard errors, n, n_windows.
+    """
+    import pandas as pd
+
+    values = ("mean", "median", "mode", "std", "skewness")
+    errors = ("std_error", *(f"{name}_std_error" for name in values[1:]))
+    numbers = ["bin_centre", "density", *values, *errors]
+    rows = [
+        {
+            "condition": task["condition"],
+            "trial": task["trial"],
+            "stack": task["name"],
+            **{name: entry.get(name) for name in (*numbers, "n", "n_windows")},
+        }
+        for task, result in zip(tasks, results, strict=True)
+        for entry in (result.summary.get("shape_index") or {}).get("by_bin", [])
+    ]
+    columns = ["condition", "trial", "stack", *numbers, "n", "n_windows"]
+    kinds = {**dict.fromkeys(columns[:3], "str"), **dict.fromkeys(numbers, "float64")}
+    kinds |= dict.fromkeys(("n", "n_windows"), "int64")
+    return pd.DataFrame(rows, columns=columns).astype(kinds)
 
 
 def relaxation_times(tasks: Sequence[Mapping[str, Any]]) -> "pd.DataFrame | None":

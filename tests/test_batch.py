@@ -71,6 +71,10 @@ def test_a_study_is_worked_through_once(full_study: Path, tmp_path: Path) -> Non
     assert stacks["condition"].tolist() == ["untreated", "untreated", "inhibitor"]
     assert np.allclose(stacks["shape_index_mean"], 2 * np.sqrt(np.pi), rtol=0.015)
     assert (out / "report.html").is_file()
+    by_bin = pd.read_parquet(out / "shape_by_bin.parquet")
+    assert by_bin["stack"].tolist() == ["one", "two", "three"]
+    assert np.allclose(by_bin["mean"], stacks["shape_index_mean"], rtol=1e-3)
+    assert (by_bin["n_windows"] == 1).all()
     times = pd.read_parquet(out / "relaxation_times.parquet")
     assert {"condition", "trial", "bin_centre", "density", "tau_alpha", "censored"} <= set(times)
     statistics = json.loads((out / "statistics.json").read_text())
