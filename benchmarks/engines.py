@@ -1,6 +1,6 @@
 """What the engines cost: throughput of two workers, overhead per task, Dask against processes.
 
-    python benchmarks/engines.py [--repeats 3] [--scenes 20] [--pair dask two] [--append]
+    python benchmarks/engines.py [--repeats 3] [--scenes 20] [--only two dask] [--append]
 
 A sweep of small scenes with one worker, with two, and on a Dask cluster of two local worker
 processes, in turn, repeated; the throughput counts from the second to the last finished run, since
@@ -156,14 +156,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--pair", nargs=2, choices=ENGINES, help="two engines, no empty tasks")
+    parser.add_argument("--only", nargs="+", choices=ENGINES, help="engines; no empty tasks then")
     parser.add_argument("--empty", action="store_true", help="empty tasks alone")
     parser.add_argument("--append", action="store_true")
     arguments = parser.parse_args()
     before = json.loads(RESULTS.read_text()) if arguments.append else {}
     rows = before.get("repetitions", [])
     empty = before.get("ms per empty task", {"two": [], "dask": []})
-    pair = () if arguments.empty else arguments.pair or ENGINES
+    pair = () if arguments.empty else arguments.only or ENGINES
     with (
         tempfile.TemporaryDirectory() as name,
         Cluster(Path(name), "dask" in pair or arguments.empty) as cluster,
@@ -177,7 +177,7 @@ def main() -> None:
             if pair:
                 row = repetition(sweep, Path(name) / str(number), pair, cluster)
                 rows.append({"scenes": arguments.scenes, **row})
-            if not arguments.pair:
+            if not arguments.only:
                 empty["two"].append(1e3 * overhead(2, None))
                 empty["dask"].append(1e3 * overhead(2, cluster.scheduler))
     content = {

@@ -229,7 +229,7 @@ def _in_processes(
         # A killed worker breaks the whole pool, and every task in flight is a suspect. One that
         # has been a suspect too often gets its last try alone, where it can only blame itself.
         last = [index for index in waiting if tries[index] == TRIES - 1]
-        batch = last[:1] or waiting
+        batch = last[:1] or list(waiting)  # a copy: the loop takes out what has ended
         in_flight: set[int] = set()
         for outcome in _until_broken(function, tasks, batch, workers, in_flight):
             waiting.remove(outcome.index)

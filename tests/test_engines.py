@@ -48,6 +48,16 @@ def test_a_failing_task_does_not_stop_the_others(tmp_path: Path, workers: int) -
     assert (tmp_path / "4").read_text() == "16"
 
 
+def name_process(task: Task) -> None:
+    Path(task["out"]).write_text(str(os.getpid()))
+
+
+def test_the_workers_stay_for_all_tasks(tmp_path: Path) -> None:
+    """Starting a process costs seconds of loading."""
+    list(execute(name_process, tasks_for(tmp_path, list(range(12))), workers=2))
+    assert len({path.read_text() for path in tmp_path.iterdir()}) <= 2
+
+
 def test_tasks_of_a_killed_worker_are_done_by_another(tmp_path: Path) -> None:
     outcomes = list(execute(die_once, tasks_for(tmp_path, [1, 2, 3]), workers=2))
     assert sorted(o.index for o in outcomes) == [0, 1, 2]
