@@ -51,12 +51,12 @@ class Rate:
 
 
 def used(pids: Sequence[int]) -> tuple[float, float]:
-    """Seconds that the threads of these processes ran, and waited for a core."""
+    """Seconds that these processes ran, and that their main threads waited for a core."""
     ran = waited = 0.0
     for pid in pids:
-        for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
-            words = file.read_text().split()
-            ran, waited = ran + int(words[0]) / 1e9, waited + int(words[1]) / 1e9
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        ran += (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+        waited += int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
     return ran, waited
 
 

@@ -263,12 +263,13 @@ def _until_broken(
         try:
             while True:
                 for index in itertools.islice(queue, workers - len(futures)):
-                    in_flight.add(index)
                     futures.add(pool.submit(attempt, function, tasks[index], index))
+                    in_flight.add(index)
                 if not futures:
                     return
                 finished, futures = wait(futures, return_when=FIRST_COMPLETED)
-                for future in finished:
+                # What ended before the pool broke comes first.
+                for future in sorted(finished, key=lambda each: each.exception() is not None):
                     outcome = future.result()
                     in_flight.discard(outcome.index)
                     yield outcome

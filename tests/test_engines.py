@@ -59,6 +59,7 @@ def test_the_workers_stay_for_all_tasks(tmp_path: Path) -> None:
 
 
 def test_tasks_of_a_killed_worker_are_done_by_another(tmp_path: Path) -> None:
+    (tmp_path / "3").write_text("does not die")
     outcomes = list(execute(die_once, tasks_for(tmp_path, [1, 2, 3]), workers=2))
     assert sorted(o.index for o in outcomes) == [0, 1, 2]
     assert all(o.error is None for o in outcomes)
