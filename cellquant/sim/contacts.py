@@ -10,6 +10,7 @@ from cellquant.errors import InputError
 from cellquant.sim import (
     crossings,
     discs,
+    lanes,
     neighbours,
     outlines,
     overlaps,
@@ -84,17 +85,18 @@ class Layer:
         )
         size = outlines.samples_of(scene.modes) if contact == "exact" else points
         self._table, single = outlines.compass(scene.modes, size)
-        self._record = np.zeros((n_cells, outlines.record_length(n_modes)))
+        spare = lanes.QUAD - 1  # rows that the last tile of cells may write to
+        self._record = np.zeros((n_cells + spare, outlines.record_length(n_modes)))[:n_cells]
         self._energy = np.zeros(n_cells)
         if contact == "exact":
             self._single = single
-            self._work = crossings.work(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+            self._work = crossings.work(1)
             self._circle = np.zeros((size, 4))
             self._circle[:, :2] = self._table[:2].T
             self._quarter, self._starts = outlines.quarter_points(scene.modes)
             self._grid = np.zeros((n_cells, 3, outlines.row_of_samples(size)), np.float32)
             self._pattern = np.zeros((n_cells, 1 + 4 * n_modes), np.float32)
-            self._tangent = np.zeros((n_cells, 2 + 2 * n_modes))
+            self._tangent = np.zeros((n_cells, (2 * n_modes + 5) // 4 * 4))
         else:
             self._rho = np.zeros((n_cells, size))
             self._slope = np.zeros((n_cells, size))
@@ -306,6 +308,8 @@ class Layer:
     def _find_crossings(self) -> None:
         while True:
             roots, sign = self._of_blocks
+            if len(self._work[0]) < self._n_parts:
+                self._work = crossings.work(self._n_parts)
             crossings.crossings(
                 self._record,
                 self._grid,

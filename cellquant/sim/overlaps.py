@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 
 from cellquant.sim.grazes import gap
-from cellquant.sim.lanes import QUAD, doubles, load, store
+from cellquant.sim.lanes import QUAD, doubles, gather, load, store
 from cellquant.sim.outlines import BLOCK, HEAD
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
@@ -62,14 +62,44 @@ def first_power(side: Any, p: int) -> tuple[Any, Any, Any, Any, Any]:
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+def fill_lanes(record: Any, tangent: Any, rows: Any, modes: Any, tension: Any, lane: Any) -> None:
+    """Put what the shape forces of a tile of cells need side by side.
+
+    Rows of `lane`, QUAD apart: A0, cos theta, sin theta, one that is free, Re C, Im C, padding to a
+    multiple of 4, and a row of `tangent`. `rows` says where those of the cells begin.
+    """
+    n_modes = len(modes)
+    _, _, mean, _ = gather(record, rows, 0, 0)
+    _, cosine, sine, _ = gather(record, rows, 0, 4)
+    store(lane, 0, mean)
+    store(lane, QUAD, cosine)
+    store(lane, 2 * QUAD, sine)
+    for m in range(0, 2 * n_modes, 4):
+        v0, v1, v2, v3 = gather(record, rows, 0, HEAD + m)
+        at = (4 + m) * QUAD
+        store(lane, at, v0)
+        store(lane, at + QUAD, v1)
+        store(lane, at + 2 * QUAD, v2)
+        store(lane, at + 3 * QUAD, v3)
+    if len(tension) > 0:
+        length = (4 + (2 * n_modes + 3) // 4 * 4) * QUAD
+        for m in range(0, 2 * n_modes + 2, 4):
+            v0, v1, v2, v3 = gather(tangent, rows, QUAD, m)
+            at = length + m * QUAD
+            store(lane, at, v0)
+            store(lane, at + QUAD, v1)
+            store(lane, at + 2 * QUAD, v2)
+            store(lane, at + 3 * QUAD, v3)
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def shape_forces(
     tile: Any, lane: Any, inverse: Any, k: float, eta: float, modes: Any, tension: Any, out: Any
 ) -> None:
     """Convolve W with the modes, for a tile of cells.
 
-    Rows of `lane`, QUAD apart: A0, R0, cos theta, sin theta, L, L_0, a_n and b_n, Re C, Im C,
-    Re L_n, Im L_n. Rows of `out`: the overlap integral, then dH/da_n and dH/db_n over R0.
-    `inverse` holds 1 and 1 / n.
+    Rows of `lane`: see `fill_lanes`. Rows of `out`: the overlap integral, then dH/da_n and dH/db_n
+    over R0. `inverse` holds 1 and 1 / n.
     """
     n_modes = len(modes)
     half = (2 * n_modes + 3) * QUAD
@@ -77,10 +107,11 @@ def shape_forces(
         store(tile, n * QUAD, load(tile, n * QUAD) * inverse[n])
         store(tile, half + n * QUAD, load(tile, half + n * QUAD) * inverse[n])
     mean = load(lane, 0)
-    cos_1 = load(lane, 2 * QUAD)
-    sin_1 = load(lane, 3 * QUAD)
-    real = (6 + 2 * n_modes) * QUAD
-    imaginary = (6 + 3 * n_modes) * QUAD
+    cos_1 = load(lane, QUAD)
+    sin_1 = load(lane, 2 * QUAD)
+    real = 4 * QUAD
+    imaginary = (4 + n_modes) * QUAD
+    length = (4 + (2 * n_modes + 3) // 4 * 4) * QUAD
     j0 = mean * load(tile, 0)
     for m in range(n_modes):
         j0 += load(lane, real + m * QUAD) * load(tile, (m + 2) * QUAD)
@@ -88,8 +119,8 @@ def shape_forces(
     area = mean * j0
     constant = k * j0
     if len(tension) > 0:
-        constant += eta * load(lane, 5 * QUAD)
-    pull = 0.5 * constant * load(lane, QUAD) / mean
+        constant += eta * load(lane, length + QUAD)
+    pull = 0.5 * constant / mean
     cos_n = cos_1
     sin_n = sin_1
     for m in range(n_modes):
@@ -118,12 +149,13 @@ def shape_forces(
         jr *= k
         ji *= k
         if len(tension) > 0:
-            jr += eta * load(lane, (6 + 4 * n_modes + m) * QUAD)
-            ji += eta * load(lane, (6 + 5 * n_modes + m) * QUAD)
-        a = load(lane, (6 + m) * QUAD)
-        b = load(lane, (6 + n_modes + m) * QUAD)
-        store(out, (1 + m) * QUAD, jr * cos_n + ji * sin_n - a * pull)
-        store(out, (1 + n_modes + m) * QUAD, ji * cos_n - jr * sin_n - b * pull)
+            jr += eta * load(lane, length + (2 + m) * QUAD)
+            ji += eta * load(lane, length + (2 + n_modes + m) * QUAD)
+        # The constant area pulls with a_n and b_n, which are the mode turned back.
+        jr -= pull * load(lane, real + m * QUAD)
+        ji += pull * load(lane, imaginary + m * QUAD)
+        store(out, (1 + m) * QUAD, jr * cos_n + ji * sin_n)
+        store(out, (1 + n_modes + m) * QUAD, ji * cos_n - jr * sin_n)
     store(out, 0, area)
 
 
@@ -164,7 +196,8 @@ def exact_velocity(
     inverse = 1.0 / np.maximum(np.arange(n_powers), 1)
     for part in prange(n_parts):
         tile = np.empty(2 * n_powers * QUAD)
-        lane = np.empty((6 + 6 * n_modes) * QUAD)
+        lane = np.empty((12 + 4 * n_modes) * QUAD)
+        rows = np.empty(2 * QUAD, np.int64)
         out = np.empty((1 + 2 * n_modes) * QUAD)
         lens = np.empty(QUAD)
         side = np.zeros(3 * SLOTS * QUAD)
@@ -175,18 +208,9 @@ def exact_velocity(
                 used = 0
                 for column in range(QUAD):
                     i = min(begin + column, end - 1)
-                    lane[column] = record[i, 2]
-                    lane[QUAD + column] = radius[i]
-                    lane[2 * QUAD + column] = record[i, 5]
-                    lane[3 * QUAD + column] = record[i, 6]
-                    for m in range(2 * n_modes):
-                        lane[(6 + m) * QUAD + column] = state[i, 3 + m]
-                        lane[(6 + 2 * n_modes + m) * QUAD + column] = record[i, HEAD + m]
-                    if len(tension) > 0:
-                        for m in range(2):
-                            lane[(4 + m) * QUAD + column] = tangent[i, m]
-                        for m in range(2 * n_modes):
-                            lane[(6 + 4 * n_modes + m) * QUAD + column] = tangent[i, 2 + m]
+                    rows[column] = i * record.shape[1]
+                    rows[QUAD + column] = i * tangent.shape[1]
+                fill_lanes(record, tangent, rows, modes, tension, lane)
                 for column in range(min(QUAD, end - begin)):
                     i = begin + column
                     fx = 0.0
