@@ -315,6 +315,18 @@ def test_duplicate_frames_are_named() -> None:
         observe(Tracks(twice, PHYSICAL, 10.0, tracks.area), only=["msd"])
 
 
+def test_frame_numbers_that_no_movie_has_are_named() -> None:
+    tracks = movie(np.random.default_rng(15))
+    far = tracks.table.copy()
+    far.loc[far.index[-1], "frame"] = 10**12
+    with pytest.raises(InputError, match="from 0 to 1000000000000"):
+        observe(Tracks(far, PHYSICAL, 10.0, tracks.area))
+    far.loc[far["frame"] >= 30, "frame"] += 9 * 10**6
+    far.loc[far.index[-1], "frame"] = 9 * 10**6 + 59
+    with pytest.raises(InputError, match="gaps of up to 9000060 frames"):
+        observe(Tracks(far, PHYSICAL, 10.0, tracks.area), only=["msd"])
+
+
 def test_cells_at_the_border_count_half() -> None:
     # Discs thrown on a plane, seen through a window: every disc that shows is a cell.
     rng = np.random.default_rng(11)

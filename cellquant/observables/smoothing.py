@@ -14,6 +14,8 @@ from cellquant.tables import Tracks
 # With n cells the drift estimate carries 1/n of every cell's own motion; below this many cells
 # common to two frames it would be motion, not drift, that is taken away.
 MIN_DRIFT_CELLS = 8
+# Frames per position beyond which tracks are gaps and little else.
+MAX_GAPS = 1000
 
 
 @dataclass(frozen=True)
@@ -24,8 +26,8 @@ class Survey:
     ----------
     n_cut
         Rows left out because the border of the image cuts the cell.
-    n_tracks
-        Tracks with a position among the others.
+    n_rows, n_tracks
+        Positions among the others, and their tracks.
     longest_run
         Longest run of consecutive frames with a position.
     kept
@@ -41,6 +43,7 @@ class Survey:
     """
 
     n_cut: int
+    n_rows: int
     n_tracks: int
     longest_run: int
     kept: Any
@@ -101,9 +104,10 @@ def survey(
             present = np.union1d(present, frame)
     total, count = np.zeros((2, present.size)), np.zeros(present.size, dtype=np.int64)
     first, last, longest = [], [], []
-    n_cut = 0
+    n_cut = n_rows = 0
     for track, frame, place, cut in _positions(rows, keep_cut_cells):
         n_cut += cut
+        n_rows += track.size
         if not track.size:
             continue
         new = _changes(track)
@@ -126,6 +130,7 @@ def survey(
     run_length = _joined(longest)
     return Survey(
         n_cut=n_cut,
+        n_rows=n_rows,
         n_tracks=run_length.size,
         longest_run=int(run_length.max(initial=0)),
         kept=run_length >= min_points,
@@ -194,6 +199,12 @@ def trajectories_of(
     assert isinstance(head, Tracks)
     kept = found.kept
     number = np.cumsum(kept) - 1
+    spans = found.last[kept] - found.first[kept] + 1
+    if spans.sum() > MAX_GAPS * max(found.n_rows, 10**4):
+        raise InputError(
+            f"the tracks span {spans.sum()} frames but have {found.n_rows} positions, with gaps of "
+            f"up to {spans.max()} frames; track the masks again."
+        )
     layout = Layout(found.first[kept], found.last[kept])
     before = 0
     for track, frame, (x, y), _ in _positions(rows_of(source), keep_cut_cells):

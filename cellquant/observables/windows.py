@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cellquant.errors import InputError
 from cellquant.observables.trajectories import FloatArray, IntArray
 from cellquant.rows import Piece, Scan, rows_of
 from cellquant.tables import Cells, Tracks, Units
@@ -14,6 +15,7 @@ from cellquant.tables import Cells, Tracks, Units
 BIN_WIDTH = 250.0
 BIN_CENTRES = (1100.0, 1350.0, 1600.0, 1850.0, 2100.0, 2350.0, 2600.0)
 WINDOW_POINTS = 24
+MAX_FRAMES = 10**7
 DENSITY_RULE = (
     "cells per area that cells can occupy; a cell cut by the border of the image counts one half, "
     "since the image shows one of the two fields such a cell belongs to"
@@ -130,7 +132,13 @@ class Census:
 
 
 def count_by_frame(source: Tracks | Cells | Scan) -> Census:
-    """Count the rows of each frame, and the tracks."""
+    """Count the rows of each frame, and the tracks.
+
+    Raises
+    ------
+    InputError
+        If the frame numbers span more frames than any movie has.
+    """
     rows = rows_of(source)
     columns = ("frame", "touches_border", *(("track_id",) if rows.linked else ()))
     n_rows = n_tracks = 0
@@ -148,6 +156,11 @@ def count_by_frame(source: Tracks | Cells | Scan) -> Census:
     n_cells, n_cut = np.zeros(frame.size, np.int64), np.zeros(frame.size, np.int64)
     np.add.at(n_cells, index, np.concatenate(cells))
     np.add.at(n_cut, index, np.concatenate(cut))
+    if frame.size and int(frame[-1]) - int(frame[0]) >= MAX_FRAMES:
+        raise InputError(
+            f"the frame numbers run from {frame[0]} to {frame[-1]}, more than {MAX_FRAMES} frames; "
+            "number the frames of the table from 0 on, one by one."
+        )
     return Census(frame, n_cells, n_cut, n_rows, n_tracks)
 
 
