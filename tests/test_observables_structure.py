@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from cellquant.observables import observe
 from cellquant.observables.bonds import bond_order, neighbour_pairs
 from cellquant.observables.structure import pair_correlation, structure_factor
-from observables_examples import brownian, tracks_of
+from cellquant.tables import PHYSICAL, Cells
+from observables_examples import brownian, movie, tracks_of
 
 BOX = (10.0, 8.0)
 
@@ -138,6 +140,29 @@ def test_open_field_leaves_out_the_hull_and_the_border() -> None:
     found = bond_order(tracks_of(place, touches_border=near_edge))
     assert found.summary["n"] <= (~near_edge).sum()
     assert found.neighbour_summary["mean"] == pytest.approx(6, abs=0.15)
+
+
+def test_a_field_that_cells_fill_in_part_is_said() -> None:
+    rng = np.random.default_rng(12)
+    place = rng.uniform(0, 20, (400, 3, 2))
+    place = place[~((place[:, 0] > 8).all(axis=1))]  # an empty corner
+    tracks = tracks_of(place, area=400 - 144.0)
+    for name in ("pair_correlation", "structure_factor"):
+        found = observe(tracks, only=[name]).summary[name]
+        assert found["filled"] == pytest.approx(0.64, abs=0.02)
+        assert "64% of the rectangle" in found["note"] or "65%" in found["note"]
+    whole = tracks_of(rng.uniform(0, 20, (400, 3, 2)), area=400.0)
+    assert "note" not in observe(whole, only=["pair_correlation"]).summary["pair_correlation"]
+
+
+def test_cells_and_tracks_of_one_movie_have_the_same_structure() -> None:
+    tracks = movie(np.random.default_rng(13))
+    columns = [name for name in tracks.table if name not in ("track_id", "parent_track_id", "time")]
+    area = np.full(60, tracks.area)
+    cells = Cells(tracks.table[columns], PHYSICAL, 1.0, 10.0, (500.0, 500.0), 60, area)
+    for name in ("structure_factor", "pair_correlation", "neighbours"):
+        one, other = (observe(source, only=[name]).tables[name] for source in (cells, tracks))
+        np.testing.assert_allclose(one["value"], other["value"], rtol=1e-12)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])

@@ -257,7 +257,8 @@ def _correlation_length(table: pd.DataFrame, rest: FloatArray, *, moved: bool) -
     found["correlation_length"] = best
     replicates = np.array([_falls_to(r, curve[seen], float(np.exp(-1))) for curve in rest])
     if len(replicates) < 2 or not np.isfinite(replicates).all():
-        return {**found, "reason": "without one of the blocks there is no crossing, so no error"}
+        found["std_error_reason"] = "without one of the blocks the curve does not fall to 1/e"
+        return found
     found["correlation_length_std_error"] = float(jackknife_error(replicates))
     return found
 

@@ -21,6 +21,7 @@ def structure_factor(context: Context, out: Results) -> None:
     out.summary["wave_number"] = dict(context.wave_number)
     out.summary["structure_factor"] = {
         **context.structure.peak,
+        **context.layer.note,
         "n_frames": int(context.layer.frames.size),
     }
     out.tables["structure_factor"] = context.structure.table
@@ -31,7 +32,11 @@ def pair_correlation(context: Context, out: Results) -> None:
 
     found = measure(context.layer, diameter=context.diameter["mean_diameter"])
     out.tables["pair_correlation"] = found.table
-    out.summary["pair_correlation"] = {**found.peak, "n_frames": int(context.layer.frames.size)}
+    out.summary["pair_correlation"] = {
+        **found.peak,
+        "n_frames": int(context.layer.frames.size),
+        **context.layer.note,
+    }
 
 
 def hexatic_order(context: Context, out: Results) -> None:

@@ -33,10 +33,11 @@ class Layer:
     frames
         The chosen frame numbers.
     corner, edges
-        Lower corner and edges of the rectangle: the periodic box, the field of view, or the
-        extent of all positions where the field is not known.
+        Lower corner and edges of the rectangle: the periodic box, or the extent of all positions.
     periodic
         Whether the rectangle is a periodic box.
+    filled
+        Share of the rectangle that cells can occupy, at most 1.
     """
 
     rows: pd.DataFrame
@@ -44,6 +45,19 @@ class Layer:
     corner: FloatArray
     edges: FloatArray
     periodic: bool
+    filled: float = 1.0
+
+    @property
+    def note(self) -> dict[str, Any]:
+        """Summary entries on a rectangle that cells fill in part only; nothing where they do."""
+        if self.filled > 0.9:
+            return {}
+        note = (
+            f"cells can occupy {self.filled:.0%} of the rectangle around them: the contrast with "
+            "the empty part raises g(r) at every distance, its peak by up to the inverse of this "
+            "share, and S(q) at small q"
+        )
+        return {"filled": self.filled, "note": note}
 
 
 def layer_of(source: Tracks | Cells | Scan | Layer, *, max_frames: int = 32) -> Layer:
@@ -71,8 +85,6 @@ def layer_of(source: Tracks | Cells | Scan | Layer, *, max_frames: int = 32) -> 
     corner, edges = np.zeros(2), np.zeros(2)
     if box is not None:
         edges = np.array(box, dtype=np.float64)
-    elif isinstance(head, Cells):
-        edges = np.array(head.field_of_view, dtype=np.float64)
     elif present.size:
         corner, edges = low, high - low
     names = ("frame", "x", "y", "touches_border", *(("track_id",) if rows.linked else ()))
@@ -84,7 +96,11 @@ def layer_of(source: Tracks | Cells | Scan | Layer, *, max_frames: int = 32) -> 
     empty = pd.DataFrame({name: np.empty(0, TRACK_COLUMNS[name]) for name in names})
     table = pd.concat(parts, ignore_index=True) if parts else empty
     table = table.sort_values("frame", kind="stable").reset_index(drop=True)
-    return Layer(table, present, corner, edges, box is not None)
+    filled = 1.0
+    if box is None and (edges > 0).all():
+        area = head.area if isinstance(head, Tracks) else float(np.mean(head.occupied_area))
+        filled = min(1.0, area / float(np.prod(edges)))
+    return Layer(table, present, corner, edges, box is not None, filled)
 
 
 def blocks_of(layer: Layer, used: Any = slice(None)) -> Blocks:
@@ -188,7 +204,7 @@ def structure_factor(
         return StructureFactor(empty, {**none, "reason": reason})
     density = float(np.mean([len(p) for p in frames])) / float(np.prod(layer.edges))
     # The peak is that of the spacing of the cells: of nuclei alone d is much smaller than it.
-    scale = 2 * np.pi * float(np.sqrt(density))
+    scale = 2 * np.pi * float(np.sqrt(density / layer.filled))
     limit = max(4 * 2 * np.pi / diameter if diameter else 0.0, 2 * scale)
     limit = limit if max_wave_number is None else max_wave_number
     step = 2 * np.pi / layer.edges
@@ -314,10 +330,10 @@ def pair_correlation(
     -------
     PairCorrelation
         Errors: jackknife over blocks of cells; in an open field these include the difference
-        between border and centre and are too large at long range. The peak is the highest ring,
-        refined by a parabola whose weights fall off over two rings around its own vertex, which
-        lowers a narrow peak. Empty with fewer than two cells; no peak where no ring exceeds 1 at
-        a level of 1 % for all of them together.
+        between border and centre and are too large at long range. The peak is the highest
+        place, refined by a parabola whose weights fall off over two rings around its own vertex,
+        which lowers a narrow peak. Empty with fewer than two cells; no peak where no five rings
+        together exceed 1 at a level of 1 % for all places.
     """
     layer = layer_of(source, max_frames=max_frames)
     names = ("distance", "value", "std_error")
@@ -361,7 +377,7 @@ def pair_correlation(
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         rest = leave_one_out(found) / leave_one_out(expected_pairs)
-    peak = _highest(distance, value, error, rest, expected_pairs.sum(axis=0))
+    peak = _highest(distance, value, rest, expected_pairs.sum(axis=0))
     return PairCorrelation(table, {**peak, "std_error_method": blocks.method})
 
 
@@ -372,19 +388,23 @@ _NO_PEAK: dict[str, Any] = {
 
 
 def _highest(
-    r: FloatArray, value: FloatArray, error: FloatArray, rest: FloatArray, n_expected: FloatArray
+    r: FloatArray, value: FloatArray, rest: FloatArray, n_expected: FloatArray
 ) -> dict[str, Any]:
-    """Highest ring that stands out from 1, refined, with errors from the curves without a block."""
-    # No ring of independent points should pass in 99 of 100 layers, whatever their number; a ring
-    # with few pairs has at least the error of their count.
-    error = np.maximum(np.where(np.isfinite(error), error, np.inf), np.sqrt(1 / n_expected))
-    stands_out = value - 1 > error * stats.t.ppf(1 - 0.01 / r.size, max(len(rest) - 1, 1))
+    """Highest place that stands out from 1, with errors from the curves without each block."""
+    if r.size < 8:
+        return {**_NO_PEAK, "reason": "fewer than eight rings fit into the field"}
+    # Five rings together are looked at, for more pairs. None of independent points should pass in
+    # 99 of 100 layers, whatever their number; few pairs have at least the error of their count.
+    five = np.ones(5)
+    smooth = np.convolve(value, five / 5, "valid")
+    spread = jackknife_error(np.array([np.convolve(curve, five / 5, "valid") for curve in rest]))
+    spread = np.maximum(spread, np.sqrt(1 / np.convolve(n_expected, five, "valid")))
+    reach = stats.t.ppf(1 - 0.01 / smooth.size, max(len(rest) - 1, 1))
+    stands_out = smooth - 1 > reach * np.where(np.isfinite(spread), spread, np.inf)
     if not stands_out.any():
         reason = "g(r) nowhere stands out from that of independent positions"
         return {**_NO_PEAK, "reason": reason}
-    k = int(np.argmax(np.where(stands_out, value, -np.inf)))
-    if r.size < 6:
-        return {**_NO_PEAK, "reason": "fewer than six rings fit into the field"}
+    k = int(np.argmax(np.where(stands_out, smooth, -np.inf))) + 2
     width = 2 * (r[1] - r[0])
 
     def place(curve: FloatArray) -> tuple[float, float]:
