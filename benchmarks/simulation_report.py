@@ -86,7 +86,8 @@ def main():
         parts.append("## Cost\n")
         parts.append(
             f"One exact evaluation costs {number(cost['ratio'])} times one 40-point evaluation "
-            f"(N = 1024, one thread, medians taken in turns): "
+            f"(N = 1024, one thread, medians taken in turns; least against least "
+            f"{number(cost['ratio_of_least'])}): "
             f"{number(cost['cells_per_second'] / 1e6)} million cell evaluations per second, "
             f"{number(cost['cells_per_second_best'] / 1e6)} at best. "
             "The aims are a ratio of 1 and one million"

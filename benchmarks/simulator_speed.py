@@ -162,6 +162,7 @@ def cost():
     return {
         "seconds": found,
         "ratio": found["exact"][0] / found["40 points"][0],
+        "ratio_of_least": found["exact"][3] / found["40 points"][3],
         "cells_per_second": 1024 / found["exact"][0],
         "cells_per_second_best": 1024 / found["exact"][3],
     }
