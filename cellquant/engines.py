@@ -262,7 +262,8 @@ def _until_broken(
         futures: set[Future[Outcome]] = set()
         try:
             while True:
-                for index in itertools.islice(queue, workers - len(futures)):
+                # One more than can be worked on, so that no worker waits for this process.
+                for index in itertools.islice(queue, workers + 1 - len(futures)):
                     futures.add(pool.submit(attempt, function, tasks[index], index))
                     in_flight.add(index)
                 if not futures:
