@@ -30,13 +30,13 @@ class PairImages:
         masks: "LabelStack",
         raw: "ImageStack | None",
         pixel_size: float,
-        expected: FloatArray,
     ) -> None:
         self._movie = movie
         self._masks, self._raw = masks, raw
         self._index_of = {frame: index for index, frame in enumerate(masks.frame_numbers)}
         self._pixels = movie.position / pixel_size
-        self._expected = expected / pixel_size
+        self._pixel_size = pixel_size
+        self._expected = self._pixels
         self._area = np.exp(movie.shape[:, LOG_AREA]) / pixel_size**2
         elongation = np.exp(np.hypot(movie.shape[:, 1], movie.shape[:, 2]))
         self._half = 1.5 * np.sqrt(self._area * elongation / np.pi) + 2.0
@@ -45,6 +45,11 @@ class PairImages:
         self._patch = max(2, round(1.2 * float(np.sqrt(typical / np.pi))))
         self._kept: dict[tuple[bool, int], np.ndarray[Any, Any]] = {}
         self._families: dict[tuple[int, int, int], FloatArray] = {}
+
+    def expect(self, place: FloatArray) -> None:
+        """Set where each cell (N, 2) is expected in the next frame."""
+        self._expected = place / self._pixel_size
+        self._families.clear()
 
     def _frame(self, index: int, *, raw: bool) -> np.ndarray[Any, Any]:
         key = (raw, index)

@@ -123,9 +123,13 @@ def solve(
         )
         if masks is not None and options.use_images and turn >= _IMAGE_PASS:
             if images is None:
+                images = PairImages(movie, masks, raw, pixel_size)
+            # Looked at twice: the last pass expects the cells more exactly.
+            if state.looks is None or turn == PASSES - 1:
                 ahead = expected_steps(movie, state.known, state.motion, own_path=True)
-                images = PairImages(movie, masks, raw, pixel_size, movie.position + ahead)
-            _add_images(state, images)
+                images.expect(movie.position + ahead)
+                state.looked, state.looks = _compare(state, images)
+            _add_images(state)
         middle = movie.position + expected_steps(movie, state.known, state.motion, own_path=False)
         if options.divisions and turn >= _DIVISION_PASS:
             state.divisions = fit_divisions(
@@ -194,16 +198,13 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
         state.rates = suppose_divisions(state.rates)
 
 
-def _add_images(state: Solution, images: PairImages) -> None:
+def _add_images(state: Solution) -> None:
     """Add image correlation to the gains, calibrated on the present links."""
-    links, gain = state.links, state.gain
+    links, gain, source = state.links, state.gain, state.looked
     assert links is not None
     assert gain is not None
-    if state.looked is None or state.looks is None:
-        state.looked, state.looks = _compare(state, images)
-    if not state.looks:
+    if not state.looks or source is None:
         return
-    source = state.looked
     target = state.candidates[source]
     linked = (links.after[source, None] == target) & (links.second[source, None] < 0)
     stranger = links.before[target] != source[:, None]
