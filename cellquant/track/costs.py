@@ -203,7 +203,10 @@ def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Moti
             terms.append(6)
         if use.sum() < 4 * TERMS:
             continue
-        found = _student_fit(x[use][:, terms], y[use], weight[use], before.scale[kind], spacing)
+        taken = np.flatnonzero(use)
+        taken = taken[:: max(1, len(taken) // _FIT_LINKS)]
+        part = x[np.ix_(taken, terms)]
+        found = _student_fit(part, y[taken], weight[taken], before.scale[kind], spacing)
         coefficients[kind] = 0.0
         coefficients[kind, terms], scale[kind], tail[kind] = found
     kinds: IntArray = 2 * paths.has_before[source] + paths.has_after[target]
