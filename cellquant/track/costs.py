@@ -205,7 +205,7 @@ def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Moti
             continue
         taken = np.flatnonzero(use)
         taken = taken[:: max(1, len(taken) // _FIT_LINKS)]
-        part = x[np.ix_(taken, terms)]
+        part = x[taken][:, terms]
         found = _student_fit(part, y[taken], weight[taken], before.scale[kind], spacing)
         coefficients[kind] = 0.0
         coefficients[kind, terms], scale[kind], tail[kind] = found
@@ -400,9 +400,13 @@ def gains(
         (paths.around_after[:, 0], paths.around_after[:, 1], paths.around_before[:, 0]), axis=1
     )
     around_target = np.stack((paths.around_before[:, 0], paths.around_after[:, 0]), axis=1)
+    centred = movie.shape - shapes.typical
+    root = np.linalg.cholesky(shapes.link_precision)
+    far = np.sum((centred @ np.linalg.cholesky(shapes.population_precision)) ** 2, axis=1)
+    half = (_SHAPE_TAIL + centred.shape[1]) / 2
+    unlike = shapes.constant + half * np.log1p(far / _SHAPE_TAIL)
     pair_gains(
         movie.position,
-        movie.shape,
         movie.cut,
         candidates,
         elapsed,
@@ -417,13 +421,11 @@ def gains(
         motion.coefficients,
         motion.scale,
         motion.tail,
-        shapes.typical,
-        shapes.memory,
-        shapes.link_precision,
-        shapes.population_precision,
-        shapes.constant,
+        centred @ root,
+        (shapes.memory * centred) @ root,
         shapes.spread,
         shapes.informative,
+        unlike,
         _SHAPE_TAIL,
         fates.stay,
         fates.vanish,

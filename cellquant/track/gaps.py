@@ -67,6 +67,7 @@ def _candidates(
     spans: list[IntArray] = []
     n_frames = len(movie.time)
     frame_of = movie.frame_index
+    trees: dict[int, cKDTree] = {}
     for index in range(n_frames - 2):
         ends = ends_all[frame_of[ends_all] == index]
         if len(ends) == 0:
@@ -78,7 +79,9 @@ def _candidates(
                 break
             # The flow of the missing frame, read where the cell would be.
             bridge = movie.cells_of(later - 1)
-            _, nearest = cKDTree(movie.position[bridge]).query(place)
+            if later - 1 not in trees:
+                trees[later - 1] = cKDTree(movie.position[bridge])
+            _, nearest = trees[later - 1].query(place)
             place = place + flow[bridge][nearest]
             starts = starts_all[frame_of[starts_all] == later]
             if len(starts) == 0:

@@ -155,7 +155,6 @@ def marginals(
 @njit(cache=True)
 def pair_gains(
     position: FloatArray,
-    shape: FloatArray,
     cut: BoolArray,
     candidates: IntArray,
     elapsed: FloatArray,
@@ -170,13 +169,11 @@ def pair_gains(
     coefficients: FloatArray,
     scale: FloatArray,
     tail: FloatArray,
-    typical: FloatArray,
-    memory: FloatArray,
-    link_precision: FloatArray,
-    population_precision: FloatArray,
-    shape_constant: float,
+    shape_after: FloatArray,
+    shape_expected: FloatArray,
     shape_spread: FloatArray,
     informative: FloatArray,
+    unlike: FloatArray,
     shape_tail: float,
     stay: FloatArray,
     leave: FloatArray,
@@ -189,11 +186,17 @@ def pair_gains(
     gain (N, K); candidates (N, K) with -1 where there is none. The residual of the displacement
     from its prediction has a two-dimensional Student density; so has the change of shape, against
     the density of shapes in the population, unless the edge of the view cuts one of them.
+    shape_after and shape_expected (N, F) are each cell's descriptors, and those expected of its
+    successor, in units of their scatter; unlike (N,) is the negative log density of each shape in
+    the population, up to the constants of both densities.
     """
     n, k = candidates.shape
-    f = shape.shape[1]
-    delta = np.empty(f)
+    f = shape_after.shape[1]
+    half = (shape_tail + f) / 2
+    height = -np.log(2 * np.pi * scale**2)
     for i in range(n):
+        wide = f * np.log(shape_spread[i])
+        fate = stay[i] - leave[i] - 2.0 * np.log(spread[i])
         for c in range(k):
             j = candidates[i, c]
             if j < 0:
@@ -223,29 +226,19 @@ def pair_gains(
             width = scale[kind] * spread[i]
             nu = tail[kind]
             distance = (rx * rx + ry * ry) * elapsed[i] * elapsed[i] / (width * width * nu)
-            value = -np.log(2 * np.pi * width * width) - (nu / 2 + 1) * np.log1p(distance)
-            value += stay[i] - leave[i] - appear[j]
+            value = height[kind] + fate - appear[j] - (nu / 2 + 1) * np.log1p(distance)
             # No shape makes up for such a step.
             if cut[i] or cut[j] or value < -30.0:
                 gain[i, c] = value
                 continue
             near = 0.0
-            far = 0.0
             for d in range(f):
-                delta[d] = shape[j, d] - typical[d] - memory[d] * (shape[i, d] - typical[d])
-            for d in range(f):
-                for e in range(f):
-                    near += delta[d] * link_precision[d, e] * delta[e]
-                    far += (
-                        (shape[j, d] - typical[d])
-                        * population_precision[d, e]
-                        * (shape[j, e] - typical[e])
-                    )
-            half = (shape_tail + f) / 2
-            near /= shape_spread[i] ** 2
-            odds = shape_constant - f * np.log(shape_spread[i])
-            odds -= half * (np.log1p(near / shape_tail) - np.log1p(far / shape_tail))
-            gain[i, c] = value + np.log(1.0 - informative[i] + informative[i] * np.exp(odds))
+                near += (shape_after[j, d] - shape_expected[i, d]) ** 2
+            near /= shape_spread[i] ** 2 * shape_tail
+            odds = unlike[j] - wide - half * np.log1p(near)
+            if informative[i] < 1.0:
+                odds = np.log(1.0 - informative[i] + informative[i] * np.exp(odds))
+            gain[i, c] = value + odds
 
 
 @njit(cache=True)

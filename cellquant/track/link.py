@@ -187,22 +187,22 @@ def number_tracks(after: IntArray, second: IntArray) -> tuple[IntArray, IntArray
     track. A link always points to a later cell.
     """
     n = len(after)
-    track_id = np.zeros(n, dtype=np.int64)
-    parent_of = np.zeros(n + 1, dtype=np.int64)
-    mother = np.zeros(n, dtype=np.int64)
-    count = 0
+    following, other = after.tolist(), second.tolist()
+    track = [0] * n
+    mother = [0] * n
+    parent_of = [0]
     for cell in range(n):
-        if track_id[cell] == 0:
-            count += 1
-            track_id[cell] = count
-            parent_of[count] = mother[cell]
-        if after[cell] < 0:
+        if track[cell] == 0:
+            parent_of.append(mother[cell])
+            track[cell] = len(parent_of) - 1
+        if following[cell] < 0:
             continue
-        if second[cell] >= 0:
-            mother[after[cell]] = mother[second[cell]] = track_id[cell]
+        if other[cell] >= 0:
+            mother[following[cell]] = mother[other[cell]] = track[cell]
         else:
-            track_id[after[cell]] = track_id[cell]
-    return track_id, parent_of[track_id]
+            track[following[cell]] = track[cell]
+    track_id = np.array(track, dtype=np.int64)
+    return track_id, np.array(parent_of, dtype=np.int64)[track_id]
 
 
 def _table(
