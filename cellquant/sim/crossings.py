@@ -466,6 +466,203 @@ def put(roots: Any, r: int, result: Any, g: int, sign: Any, value: float) -> Non
     sign[r] = value
 
 
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+def search_part(
+    record: Any,
+    grid: Any,
+    pattern: Any,
+    circle: Any,
+    compass: Any,
+    first: Any,
+    other: Any,
+    shift: Any,
+    modes: Any,
+    roots: Any,
+    root_first: Any,
+    root_last: Any,
+    sign: Any,
+    inside: Any,
+    fault: Any,
+    work_rows: Any,
+    work_hints: Any,
+    work_result: Any,
+    part: int,
+    n_parts: int,
+) -> None:
+    """One part of `crossings`; here it is compiled once, inside a parallel loop twice."""
+    n_cells = record.shape[0]
+    stride = record.shape[1]
+    size = compass.shape[1]
+    spacing: Any = np.float32(2.0 * math.pi / size)
+    n_blocks = (n_cells + BLOCK - 1) // BLOCK
+    room = roots.shape[0] // n_blocks
+    near = np.zeros(5 * PAIRS, np.float32)
+    apart = np.zeros((PAIRS, 4))
+    start = np.empty(PAIRS, np.float32)
+    count = np.empty(PAIRS, np.float32)
+    owner = np.empty(PAIRS, np.int64)
+    code = np.empty(PAIRS, np.int64)
+    total = np.empty(PAIRS, np.int64)
+    cursor = np.empty(PAIRS, np.int64)
+    depth = np.zeros(PAIRS * (size + 5 * LANES), np.float32)
+    change = np.zeros(PAIRS * (size + 5 * LANES), np.float32)
+    place = np.full(LISTED, LANES)
+    weight = np.zeros(LISTED, np.float32)
+    mean = np.ones(LISTED, np.float32)
+    kind = np.empty(LISTED, np.float32)
+    rows = work_rows[part]
+    hints = work_hints[part]
+    target = np.empty(LISTED, np.int64)
+    result = work_result[part]
+    scratch = np.empty((2 * len(modes) + 4) * LANES)
+    stack = np.empty((40, 6))
+    found = np.empty((8 * size, 4))
+    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
+        n_roots = block * room
+        full = n_roots + room
+        i = block * BLOCK
+        last_pair = first[min(n_cells, (block + 1) * BLOCK)]
+        for begin in range(first[i], last_pair, PAIRS):
+            filled = min(PAIRS, last_pair - begin)
+            for k in range(filled):
+                p = begin + k
+                while first[i + 1] <= p:
+                    i += 1
+                j = other[p]
+                owner[k] = i
+                apart[k, 0] = record[j, 0] + shift[p, 0] - record[i, 0]
+                apart[k, 1] = record[j, 1] + shift[p, 1] - record[i, 1]
+                near[k] = apart[k, 0]
+                near[PAIRS + k] = apart[k, 1]
+                near[2 * PAIRS + k] = record[i, 4]
+                near[3 * PAIRS + k] = record[i, 3]
+                near[4 * PAIRS + k] = record[j, 3]
+                narrow = record[i, 4] < NARROW * record[i, 2]
+                narrow |= record[j, 4] < NARROW * record[j, 2]
+                code[k] = CLOSELY if narrow else OUTSIDE
+                total[k] = 0
+            listed = other[begin : begin + filled]
+            find_windows(near, start, count, filled, modes)
+            sample_pairs(
+                grid, pattern, owner, listed, near, start, count, filled, modes, depth, change
+            )
+            n_gaps = list_gaps(
+                pattern, owner, listed, start, count, filled, size, stride, depth, change,
+                place, weight, mean, rows, code,
+            )  # fmt: skip
+            # First the first crossing of every gap; those with two are then listed once more.
+            n_listed = n_gaps
+            for second in range(2):
+                judge_gaps(
+                    depth, change, place, weight, mean, second * n_gaps,
+                    n_listed if second else n_gaps, second == 1, spacing, kind, hints,
+                )  # fmt: skip
+                if second:
+                    break
+                for g in range(n_gaps):
+                    number = int(kind[g])
+                    k = rows[1, g] // 4
+                    total[k] += number
+                    if number == UNSURE:
+                        code[k] = CLOSELY
+                    elif number == TWO:
+                        copy_gap(g, n_listed, place, weight, mean, rows, hints)
+                        n_listed += 1
+            for k in range(filled):
+                p = begin + k
+                n_samples = int(count[k])
+                root_first[p] = n_roots
+                inside[p] = 0
+                empty = total[k] == 0
+                within = code[k] == INSIDE
+                if n_samples > 0 and code[k] == CLOSELY:
+                    n_found = search_closely(
+                        record, owner[k], other[p], apart[k, 0], apart[k, 1], compass,
+                        int(start[k]), n_samples, modes, stack, found,
+                    )  # fmt: skip
+                    if n_found == -1:
+                        inside[p] = 1  # the same contour twice: i counts as inside j
+                    empty = n_found == 0
+                    within = empty and found[0, 3] > 0.0
+                    if n_roots + n_found > full:
+                        fault[block] = OVERFLOW
+                        n_found = 0
+                    for q in range(n_found):
+                        s = int(found[q, 0])
+                        settle(
+                            record, owner[k], other[p], apart[k, 0], apart[k, 1],
+                            compass[0, s], compass[1, s], found[q, 1], found[q, 2], math.nan,
+                            found[q, 3], modes, roots, n_roots,
+                        )  # fmt: skip
+                        sign[n_roots] = found[q, 3]
+                        n_roots += 1
+                elif n_roots + total[k] > full:
+                    fault[block] = OVERFLOW
+                    code[k] = CLOSELY
+                else:
+                    cursor[k] = n_roots
+                    n_roots += total[k]
+                root_last[p] = n_roots
+                if empty and n_samples > 0:
+                    reach = math.sqrt(apart[k, 0] ** 2 + apart[k, 1] ** 2) + record[other[p], 4]
+                    if n_samples > size and within:
+                        inside[p] = 1
+                    elif reach < record[owner[k], 3]:
+                        inner, _, _, _, _, _ = gap(
+                            record, other[p], owner[k], -apart[k, 0], -apart[k, 1], 1.0, 0.0,
+                            modes,
+                        )  # fmt: skip
+                        if inner > 0.0:
+                            inside[p] = 2
+            # What one step does not settle takes a second one, then safeguarded ones.
+            again = n_listed
+            for attempt in range(2):
+                ending = again if attempt else n_listed
+                for g in range(ending, ending + (attempt * n_listed - ending) % LANES):
+                    copy_gap(ending - 1, g, place, weight, mean, rows, hints)
+                polish(
+                    attempt * n_listed, ending, circle, apart, record, rows, hints, modes,
+                    scratch, result,
+                )  # fmt: skip
+                if attempt == 1:
+                    break
+                partner = n_gaps
+                for g in range(n_gaps):
+                    number = int(kind[g])
+                    k = rows[1, g] // 4
+                    if code[k] == CLOSELY or number == 0:
+                        partner += number == TWO
+                        continue
+                    value = 1.0 if depth[place[g]] > 0.0 else -1.0
+                    source = g
+                    for side in range(number):
+                        if side == 1:
+                            source = partner
+                            value = -value
+                            partner += 1
+                        r = cursor[k]
+                        cursor[k] = r + 1
+                        put(roots, r, result, source, sign, value)
+                        if not result[source, 6] < SETTLED:
+                            copy_gap(source, again, place, weight, mean, rows, hints)
+                            if hints[2, source] < result[source, 7] < hints[3, source]:
+                                hints[0, again] = result[source, 7]
+                            target[again] = r
+                            again += 1
+            for g in range(n_listed, again):
+                r = target[g]
+                if result[g, 6] < SETTLED:
+                    put(roots, r, result, g, sign, sign[r])
+                    continue
+                k = rows[1, g] // 4
+                s = rows[0, g] // 4
+                settle(
+                    record, owner[k], other[begin + k], apart[k, 0], apart[k, 1],
+                    compass[0, s], compass[1, s], hints[2, g], hints[3, g], result[g, 7],
+                    sign[r], modes, roots, r,
+                )  # fmt: skip
+
+
 @njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
 def crossings(
     record: Any,
@@ -495,175 +692,27 @@ def crossings(
     are dealt out in `n_parts` parts, each with its own work arrays (see `work`); no result depends
     on their number.
     """
-    n_cells = record.shape[0]
-    stride = record.shape[1]
-    size = compass.shape[1]
-    spacing: Any = np.float32(2.0 * math.pi / size)
-    n_blocks = (n_cells + BLOCK - 1) // BLOCK
-    room = roots.shape[0] // n_blocks
     for part in prange(n_parts):
-        near = np.zeros(5 * PAIRS, np.float32)
-        apart = np.zeros((PAIRS, 4))
-        start = np.empty(PAIRS, np.float32)
-        count = np.empty(PAIRS, np.float32)
-        owner = np.empty(PAIRS, np.int64)
-        code = np.empty(PAIRS, np.int64)
-        total = np.empty(PAIRS, np.int64)
-        cursor = np.empty(PAIRS, np.int64)
-        depth = np.zeros(PAIRS * (size + 5 * LANES), np.float32)
-        change = np.zeros(PAIRS * (size + 5 * LANES), np.float32)
-        place = np.full(LISTED, LANES)
-        weight = np.zeros(LISTED, np.float32)
-        mean = np.ones(LISTED, np.float32)
-        kind = np.empty(LISTED, np.float32)
-        rows = work_rows[part]
-        hints = work_hints[part]
-        target = np.empty(LISTED, np.int64)
-        result = work_result[part]
-        scratch = np.empty((2 * len(modes) + 4) * LANES)
-        stack = np.empty((40, 6))
-        found = np.empty((8 * size, 4))
-        for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
-            n_roots = block * room
-            full = n_roots + room
-            i = block * BLOCK
-            last_pair = first[min(n_cells, (block + 1) * BLOCK)]
-            for begin in range(first[i], last_pair, PAIRS):
-                filled = min(PAIRS, last_pair - begin)
-                for k in range(filled):
-                    p = begin + k
-                    while first[i + 1] <= p:
-                        i += 1
-                    j = other[p]
-                    owner[k] = i
-                    apart[k, 0] = record[j, 0] + shift[p, 0] - record[i, 0]
-                    apart[k, 1] = record[j, 1] + shift[p, 1] - record[i, 1]
-                    near[k] = apart[k, 0]
-                    near[PAIRS + k] = apart[k, 1]
-                    near[2 * PAIRS + k] = record[i, 4]
-                    near[3 * PAIRS + k] = record[i, 3]
-                    near[4 * PAIRS + k] = record[j, 3]
-                    narrow = record[i, 4] < NARROW * record[i, 2]
-                    narrow |= record[j, 4] < NARROW * record[j, 2]
-                    code[k] = CLOSELY if narrow else OUTSIDE
-                    total[k] = 0
-                listed = other[begin : begin + filled]
-                find_windows(near, start, count, filled, modes)
-                sample_pairs(
-                    grid, pattern, owner, listed, near, start, count, filled, modes, depth, change
-                )
-                n_gaps = list_gaps(
-                    pattern, owner, listed, start, count, filled, size, stride, depth, change,
-                    place, weight, mean, rows, code,
-                )  # fmt: skip
-                # First the first crossing of every gap; those with two are then listed once more.
-                n_listed = n_gaps
-                for second in range(2):
-                    judge_gaps(
-                        depth, change, place, weight, mean, second * n_gaps,
-                        n_listed if second else n_gaps, second == 1, spacing, kind, hints,
-                    )  # fmt: skip
-                    if second:
-                        break
-                    for g in range(n_gaps):
-                        number = int(kind[g])
-                        k = rows[1, g] // 4
-                        total[k] += number
-                        if number == UNSURE:
-                            code[k] = CLOSELY
-                        elif number == TWO:
-                            copy_gap(g, n_listed, place, weight, mean, rows, hints)
-                            n_listed += 1
-                for k in range(filled):
-                    p = begin + k
-                    n_samples = int(count[k])
-                    root_first[p] = n_roots
-                    inside[p] = 0
-                    empty = total[k] == 0
-                    within = code[k] == INSIDE
-                    if n_samples > 0 and code[k] == CLOSELY:
-                        n_found = search_closely(
-                            record, owner[k], other[p], apart[k, 0], apart[k, 1], compass,
-                            int(start[k]), n_samples, modes, stack, found,
-                        )  # fmt: skip
-                        if n_found == -1:
-                            inside[p] = 1  # the same contour twice: i counts as inside j
-                        empty = n_found == 0
-                        within = empty and found[0, 3] > 0.0
-                        if n_roots + n_found > full:
-                            fault[block] = OVERFLOW
-                            n_found = 0
-                        for q in range(n_found):
-                            s = int(found[q, 0])
-                            settle(
-                                record, owner[k], other[p], apart[k, 0], apart[k, 1],
-                                compass[0, s], compass[1, s], found[q, 1], found[q, 2], math.nan,
-                                found[q, 3], modes, roots, n_roots,
-                            )  # fmt: skip
-                            sign[n_roots] = found[q, 3]
-                            n_roots += 1
-                    elif n_roots + total[k] > full:
-                        fault[block] = OVERFLOW
-                        code[k] = CLOSELY
-                    else:
-                        cursor[k] = n_roots
-                        n_roots += total[k]
-                    root_last[p] = n_roots
-                    if empty and n_samples > 0:
-                        reach = math.sqrt(apart[k, 0] ** 2 + apart[k, 1] ** 2) + record[other[p], 4]
-                        if n_samples > size and within:
-                            inside[p] = 1
-                        elif reach < record[owner[k], 3]:
-                            inner, _, _, _, _, _ = gap(
-                                record, other[p], owner[k], -apart[k, 0], -apart[k, 1], 1.0, 0.0,
-                                modes,
-                            )  # fmt: skip
-                            if inner > 0.0:
-                                inside[p] = 2
-                # What one step does not settle takes a second one, then safeguarded ones.
-                again = n_listed
-                for attempt in range(2):
-                    ending = again if attempt else n_listed
-                    for g in range(ending, ending + (attempt * n_listed - ending) % LANES):
-                        copy_gap(ending - 1, g, place, weight, mean, rows, hints)
-                    polish(
-                        attempt * n_listed, ending, circle, apart, record, rows, hints, modes,
-                        scratch, result,
-                    )  # fmt: skip
-                    if attempt == 1:
-                        break
-                    partner = n_gaps
-                    for g in range(n_gaps):
-                        number = int(kind[g])
-                        k = rows[1, g] // 4
-                        if code[k] == CLOSELY or number == 0:
-                            partner += number == TWO
-                            continue
-                        value = 1.0 if depth[place[g]] > 0.0 else -1.0
-                        source = g
-                        for side in range(number):
-                            if side == 1:
-                                source = partner
-                                value = -value
-                                partner += 1
-                            r = cursor[k]
-                            cursor[k] = r + 1
-                            put(roots, r, result, source, sign, value)
-                            if not result[source, 6] < SETTLED:
-                                copy_gap(source, again, place, weight, mean, rows, hints)
-                                if hints[2, source] < result[source, 7] < hints[3, source]:
-                                    hints[0, again] = result[source, 7]
-                                target[again] = r
-                                again += 1
-                for g in range(n_listed, again):
-                    r = target[g]
-                    if result[g, 6] < SETTLED:
-                        put(roots, r, result, g, sign, sign[r])
-                        continue
-                    k = rows[1, g] // 4
-                    s = rows[0, g] // 4
-                    settle(
-                        record, owner[k], other[begin + k], apart[k, 0], apart[k, 1],
-                        compass[0, s], compass[1, s], hints[2, g], hints[3, g], result[g, 7],
-                        sign[r], modes, roots, r,
-                    )  # fmt: skip
+        number: Any = np.int64(part)  # one type for all that is compiled
+        search_part(
+            record,
+            grid,
+            pattern,
+            circle,
+            compass,
+            first,
+            other,
+            shift,
+            modes,
+            roots,
+            root_first,
+            root_last,
+            sign,
+            inside,
+            fault,
+            work_rows,
+            work_hints,
+            work_result,
+            number,
+            n_parts,
+        )

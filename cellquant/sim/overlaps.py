@@ -159,6 +159,154 @@ def shape_forces(
     store(out, 0, area)
 
 
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+def push_part(
+    state: Any,
+    radius: Any,
+    record: Any,
+    tangent: Any,
+    first: Any,
+    second: Any,
+    back_first: Any,
+    back_pair: Any,
+    back_cell: Any,
+    roots: Any,
+    root_first: Any,
+    root_last: Any,
+    sign: Any,
+    inside: Any,
+    numbers: Any,
+    modes: Any,
+    tension: Any,
+    torque: Any,
+    velocity: Any,
+    energy: Any,
+    part: int,
+    n_parts: int,
+) -> None:
+    """One part of `exact_velocity`; here it is compiled once, inside a parallel loop twice."""
+    v0, k, eta = numbers[0], numbers[1], numbers[2]
+    mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
+    n_cells = state.shape[0]
+    n_modes = len(modes)
+    n_blocks = (n_cells + BLOCK - 1) // BLOCK
+    n_powers = 2 * len(modes) + 3
+    inverse = 1.0 / np.maximum(np.arange(n_powers), 1)
+    tile = np.empty(2 * n_powers * QUAD)
+    lane = np.empty((12 + 4 * n_modes) * QUAD)
+    rows = np.empty(2 * QUAD, np.int64)
+    out = np.empty((1 + 2 * n_modes) * QUAD)
+    lens = np.empty(QUAD)
+    side = np.zeros(3 * SLOTS * QUAD)
+    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
+        end = min(n_cells, (block + 1) * BLOCK)
+        for begin in range(block * BLOCK, end, QUAD):
+            tile[:] = 0.0
+            used = 0
+            for column in range(QUAD):
+                i = min(begin + column, end - 1)
+                rows[column] = i * record.shape[1]
+                rows[QUAD + column] = i * tangent.shape[1]
+            fill_lanes(record, tangent, rows, modes, tension, lane)
+            for column in range(min(QUAD, end - begin)):
+                i = begin + column
+                fx = 0.0
+                fy = 0.0
+                spin = 0.0
+                shared = 0.0
+                whole = 0.0
+                filled = 0
+                arcs_r = 1.0
+                arcs_i = 0.0
+                n_own = first[i + 1] - first[i]
+                n_all = n_own + back_first[i + 1] - back_first[i]
+                for entry in range(n_all):
+                    own = entry < n_own
+                    if own:
+                        p = first[i] + entry
+                    else:
+                        p = back_pair[back_first[i] + entry - n_own]
+                    if inside[p] == (1 if own else 2):
+                        whole += 2.0 * math.pi
+                    if root_first[p] == root_last[p]:
+                        continue
+                    arc_r = 1.0
+                    arc_i = 0.0
+                    for r in range(root_first[p], root_last[p]):
+                        if own:
+                            s = sign[r]
+                            c1 = roots[r, 0]
+                            s1 = roots[r, 1]
+                            distance = roots[r, 4]
+                            turned = c1 * roots[r, 3] - s1 * roots[r, 2]
+                            shared -= 0.5 * s * distance * roots[r, 5] * turned
+                        else:
+                            s = -sign[r]
+                            c1 = roots[r, 2]
+                            s1 = roots[r, 3]
+                            distance = roots[r, 5]
+                        fx += s * distance * s1
+                        fy -= s * distance * c1
+                        spin += 0.5 * s * distance * distance
+                        arc_r, arc_i = arc_r * c1 - s * arc_i * s1, arc_i * c1 + s * arc_r * s1
+                        if filled == SLOTS:
+                            add_powers(side, SLOTS, modes, tile)
+                            filled = 0
+                            used = 0
+                        side[filled * QUAD + column] = s
+                        side[(SLOTS + filled) * QUAD + column] = c1
+                        side[(2 * SLOTS + filled) * QUAD + column] = s1
+                        filled += 1
+                    if arc_r > 0.0 and arc_i >= 0.0:
+                        # Short arcs are turned together; their sum is below pi.
+                        arcs_r, arcs_i = (
+                            arcs_r * arc_r - arcs_i * arc_i,
+                            arcs_r * arc_i + arcs_i * arc_r,
+                        )
+                        if arcs_r <= 0.0:
+                            whole += math.atan2(arcs_i, arcs_r)
+                            arcs_r = 1.0
+                            arcs_i = 0.0
+                        continue
+                    angle = math.atan2(arc_i, arc_r)
+                    if angle < 0.0:
+                        angle += 2.0 * math.pi
+                        if angle > 2.0 * math.pi - 1e-6:
+                            # Round-off, or a cell inside but for a sliver: ask its far side.
+                            r = root_first[p]
+                            dx = roots[r, 4] * roots[r, 0] - roots[r, 5] * roots[r, 2]
+                            dy = roots[r, 4] * roots[r, 1] - roots[r, 5] * roots[r, 3]
+                            # The pair is the same seen from either cell but for its sign.
+                            turn = 1.0 if own else -1.0
+                            c1 = -(roots[r, 0] if own else roots[r, 2])
+                            s1 = -(roots[r, 1] if own else roots[r, 3])
+                            j = second[p]
+                            if not own:
+                                j = back_cell[back_first[i] + entry - n_own]
+                            g, _, _, _, _, _ = gap(
+                                record, i, j, turn * dx, turn * dy, c1, s1, modes
+                            )
+                            if g <= 0.0:
+                                angle = 0.0
+                    whole += angle
+                tile[column] = whole + math.atan2(arcs_i, arcs_r)
+                used = max(used, filled)
+                velocity[i, 0] = v0 * record[i, 5] - mu_r * k * fx
+                velocity[i, 1] = v0 * record[i, 6] - mu_r * k * fy
+                velocity[i, 2] = mu_theta * k * spin if len(torque) > 0 else 0.0
+                lens[column] = shared
+            if used > 0:
+                add_powers(side, used, modes, tile)
+            shape_forces(tile, lane, inverse, k, eta, modes, tension, out)
+            for column in range(min(QUAD, end - begin)):
+                i = begin + column
+                scale = mu_ab * radius[i]
+                for m in range(2 * n_modes):
+                    velocity[i, 3 + m] = -scale * out[(1 + m) * QUAD + column]
+                bound = eta * tangent[i, 0] if len(tension) > 0 else 0.0
+                energy[i] = bound + k * (0.5 * out[column] + lens[column])
+
+
 @njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
 def exact_velocity(
     state: Any,
@@ -187,124 +335,29 @@ def exact_velocity(
 
     `numbers` holds v0, k, eta, mu_r, mu_theta, mu_ab. For `n_parts` see `crossings`.
     """
-    v0, k, eta = numbers[0], numbers[1], numbers[2]
-    mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
-    n_cells = state.shape[0]
-    n_modes = len(modes)
-    n_blocks = (n_cells + BLOCK - 1) // BLOCK
-    n_powers = 2 * len(modes) + 3
-    inverse = 1.0 / np.maximum(np.arange(n_powers), 1)
     for part in prange(n_parts):
-        tile = np.empty(2 * n_powers * QUAD)
-        lane = np.empty((12 + 4 * n_modes) * QUAD)
-        rows = np.empty(2 * QUAD, np.int64)
-        out = np.empty((1 + 2 * n_modes) * QUAD)
-        lens = np.empty(QUAD)
-        side = np.zeros(3 * SLOTS * QUAD)
-        for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
-            end = min(n_cells, (block + 1) * BLOCK)
-            for begin in range(block * BLOCK, end, QUAD):
-                tile[:] = 0.0
-                used = 0
-                for column in range(QUAD):
-                    i = min(begin + column, end - 1)
-                    rows[column] = i * record.shape[1]
-                    rows[QUAD + column] = i * tangent.shape[1]
-                fill_lanes(record, tangent, rows, modes, tension, lane)
-                for column in range(min(QUAD, end - begin)):
-                    i = begin + column
-                    fx = 0.0
-                    fy = 0.0
-                    spin = 0.0
-                    shared = 0.0
-                    whole = 0.0
-                    filled = 0
-                    arcs_r = 1.0
-                    arcs_i = 0.0
-                    n_own = first[i + 1] - first[i]
-                    n_all = n_own + back_first[i + 1] - back_first[i]
-                    for entry in range(n_all):
-                        own = entry < n_own
-                        if own:
-                            p = first[i] + entry
-                        else:
-                            p = back_pair[back_first[i] + entry - n_own]
-                        if inside[p] == (1 if own else 2):
-                            whole += 2.0 * math.pi
-                        if root_first[p] == root_last[p]:
-                            continue
-                        arc_r = 1.0
-                        arc_i = 0.0
-                        for r in range(root_first[p], root_last[p]):
-                            if own:
-                                s = sign[r]
-                                c1 = roots[r, 0]
-                                s1 = roots[r, 1]
-                                distance = roots[r, 4]
-                                turned = c1 * roots[r, 3] - s1 * roots[r, 2]
-                                shared -= 0.5 * s * distance * roots[r, 5] * turned
-                            else:
-                                s = -sign[r]
-                                c1 = roots[r, 2]
-                                s1 = roots[r, 3]
-                                distance = roots[r, 5]
-                            fx += s * distance * s1
-                            fy -= s * distance * c1
-                            spin += 0.5 * s * distance * distance
-                            arc_r, arc_i = arc_r * c1 - s * arc_i * s1, arc_i * c1 + s * arc_r * s1
-                            if filled == SLOTS:
-                                add_powers(side, SLOTS, modes, tile)
-                                filled = 0
-                                used = 0
-                            side[filled * QUAD + column] = s
-                            side[(SLOTS + filled) * QUAD + column] = c1
-                            side[(2 * SLOTS + filled) * QUAD + column] = s1
-                            filled += 1
-                        if arc_r > 0.0 and arc_i >= 0.0:
-                            # Short arcs are turned together; their sum is below pi.
-                            arcs_r, arcs_i = (
-                                arcs_r * arc_r - arcs_i * arc_i,
-                                arcs_r * arc_i + arcs_i * arc_r,
-                            )
-                            if arcs_r <= 0.0:
-                                whole += math.atan2(arcs_i, arcs_r)
-                                arcs_r = 1.0
-                                arcs_i = 0.0
-                            continue
-                        angle = math.atan2(arc_i, arc_r)
-                        if angle < 0.0:
-                            angle += 2.0 * math.pi
-                            if angle > 2.0 * math.pi - 1e-6:
-                                # Round-off, or a cell inside but for a sliver: ask its far side.
-                                r = root_first[p]
-                                dx = roots[r, 4] * roots[r, 0] - roots[r, 5] * roots[r, 2]
-                                dy = roots[r, 4] * roots[r, 1] - roots[r, 5] * roots[r, 3]
-                                # The pair is the same seen from either cell but for its sign.
-                                turn = 1.0 if own else -1.0
-                                c1 = -(roots[r, 0] if own else roots[r, 2])
-                                s1 = -(roots[r, 1] if own else roots[r, 3])
-                                j = second[p]
-                                if not own:
-                                    j = back_cell[back_first[i] + entry - n_own]
-                                g, _, _, _, _, _ = gap(
-                                    record, i, j, turn * dx, turn * dy, c1, s1, modes
-                                )
-                                if g <= 0.0:
-                                    angle = 0.0
-                        whole += angle
-                    tile[column] = whole + math.atan2(arcs_i, arcs_r)
-                    used = max(used, filled)
-                    velocity[i, 0] = v0 * record[i, 5] - mu_r * k * fx
-                    velocity[i, 1] = v0 * record[i, 6] - mu_r * k * fy
-                    velocity[i, 2] = mu_theta * k * spin if len(torque) > 0 else 0.0
-                    lens[column] = shared
-                if used > 0:
-                    add_powers(side, used, modes, tile)
-                shape_forces(tile, lane, inverse, k, eta, modes, tension, out)
-                for column in range(min(QUAD, end - begin)):
-                    i = begin + column
-                    scale = mu_ab * radius[i]
-                    for m in range(2 * n_modes):
-                        velocity[i, 3 + m] = -scale * out[(1 + m) * QUAD + column]
-                    bound = eta * tangent[i, 0] if len(tension) > 0 else 0.0
-                    energy[i] = bound + k * (0.5 * out[column] + lens[column])
+        number: Any = np.int64(part)  # one type for all that is compiled
+        push_part(
+            state,
+            radius,
+            record,
+            tangent,
+            first,
+            second,
+            back_first,
+            back_pair,
+            back_cell,
+            roots,
+            root_first,
+            root_last,
+            sign,
+            inside,
+            numbers,
+            modes,
+            tension,
+            torque,
+            velocity,
+            energy,
+            number,
+            n_parts,
+        )
