@@ -354,6 +354,20 @@ def test_thinned_paths_keep_ends_and_a_bound(layer: Layer) -> None:
     )
 
 
+def test_paths_of_a_finely_sampled_layer_are_thinned_in_time_not_cut_off() -> None:
+    """256 cells on a grid, 100 frames: all are shown; with a third of the room, some everywhere."""
+    cell, frame = np.divmod(np.arange(25_600), 100)
+    x, y = cell % 16 + 0.01 * frame, cell // 16
+    table = pd.DataFrame({"track_id": cell + 1, "frame": frame, "x": x, "y": y})
+    thin = thin_paths(table, max_points=2560)
+    assert len(thin) <= 2560
+    assert thin["track_id"].nunique() == 256
+    few = thin_paths(table, max_points=800)
+    quarters = few.groupby("track_id").first().eval("(x >= 8) + 2 * (y >= 8)").value_counts()
+    assert len(quarters) == 4
+    assert quarters.min() > 0.7 * quarters.max()
+
+
 def test_tracks_of_one_frame_give_a_page_without_paths(layer: Layer, tmp_path: Path) -> None:
     table = layer.tracks.table[layer.tracks.table["frame"] == 0].reset_index(drop=True)
     page = report(layer, tmp_path / "r.html", tracks=dataclasses.replace(layer.tracks, table=table))

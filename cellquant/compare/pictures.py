@@ -189,8 +189,9 @@ def contours_of(run: "Run", *, points: int = 32) -> tuple[FloatArray, tuple[floa
 def thin_paths(table: "pd.DataFrame", *, max_points: int = MAX_POINTS) -> "pd.DataFrame":
     """Keep as many points of the trajectories as a drawing can show.
 
-    Whole tracks are kept while they fit (longest first), each thinned to every k-th frame with
-    its first and last point.
+    Tracks are thinned to every k-th frame with their first and last point, down to about eight
+    points of the longest. Where that is not enough the longest tracks are kept, of equally long
+    ones some from everywhere.
 
     Returns
     -------
@@ -200,13 +201,18 @@ def thin_paths(table: "pd.DataFrame", *, max_points: int = MAX_POINTS) -> "pd.Da
     rows = table[["track_id", "frame", "x", "y"]].sort_values(["track_id", "frame"])
     group = rows.groupby("track_id", sort=False)
     rank, length = group.cumcount(), group["frame"].transform("size")
-    every = max(1, math.ceil(len(rows) / max_points))
-    every = min(every, 6)
-    rows = rows[(rank % every == 0) | (rank == length - 1)]
-    length = rows.groupby("track_id")["frame"].transform("size")
-    rows = rows[length > 1]
-    lengths = rows.groupby("track_id").size().sort_values(ascending=False, kind="stable")
-    kept = lengths.index[lengths.cumsum() <= max_points]
+    paths = length > 1
+    rows, rank, length = rows[paths], rank[paths], length[paths]
+    every, coarsest = 1, length.max() / 8 if len(rows) else 0
+    chosen = rank >= 0
+    while chosen.sum() > max_points and every < coarsest:
+        every += 1
+        chosen = (rank % every == 0) | (rank == length - 1)
+    rows = rows[chosen]
+    sizes = rows.groupby("track_id").size()
+    order = np.lexsort([_scrambled(sizes.index.to_numpy(np.int64)), -sizes.to_numpy()])
+    sizes = sizes.iloc[order]
+    kept = sizes.index[sizes.cumsum() <= max_points]
     return rows[rows["track_id"].isin(kept)].reset_index(drop=True)
 
 
@@ -293,7 +299,12 @@ def _round_length(length: float) -> float:
 
 
 def _tone(identity: int) -> int:
-    return (identity * 2654435761 % 2**32) * len(_TONES) >> 32
+    return int(_scrambled(identity)) * len(_TONES) >> 32
+
+
+def _scrambled(identity: Any) -> Any:
+    """Whole numbers below 2**32 that are far apart where the given ones are neighbours."""
+    return identity * 2654435761 % 2**32
 
 
 def _hex(tone: int, factor: float = 1.0) -> str:
