@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 LENGTH = 23.9  # um in one L0: a disc of 450 um^2
 TIME = 2.0  # min in one t0
 PIXEL = LENGTH / 30.0  # um: cells of 15 pixels radius
+MARGIN = 1.0  # L0 by which the camera sees more than the periodic layer: each cell whole once
 FINER = 5  # frames of the run in one frame interval of the camera
 
 STAGES = {
@@ -167,6 +168,7 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
             pixel_size=PIXEL,
             length=LENGTH,
             time=TIME,
+            margin=MARGIN,
             step=FINER,
             progress=progress,
         )
@@ -203,6 +205,7 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
         "um per L0": LENGTH,
         "min per t0": TIME,
         "um per pixel": PIXEL,
+        "margin of the field, L0": MARGIN,
         "frames of the run per frame of the camera": FINER,
         "points of the smoothing, where smoothed": SMOOTHING,
     }

@@ -165,8 +165,9 @@ def _per_cent(share: float) -> str:
 _STEP_TEXTS = (
     "Frame interval: the camera sees one state in five that the run saved; what happens in between "
     "is not seen.",
-    "Field of view: cells that the edge cuts are left out, and with them a part of the layer. "
-    "This is the difference between a sample and the whole, not a fault of the measurement.",
+    "Field of view: cells that the edge cuts are left out. The camera sees one cell diameter more "
+    "than the periodic layer, so that nearly every cell is whole in one place; what remains is the "
+    "difference between a sample and the whole, not a fault of the measurement.",
     "Pixels: cells are drawn on a grid, and where two overlap each pixel goes to one of them.",
     "Linking: cells that were followed wrongly from frame to frame.",
 )
@@ -278,5 +279,6 @@ def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
         ),
         points=_STEP_TEXTS,
         tables=tables,
-        figures=tuple(figure for figure in figures if figure is not None),
+        # The recording has figures of the same kinds on the same page.
+        figures=tuple(replace(f, name=f"loop-{f.name}") for f in figures if f is not None),
     )

@@ -1,14 +1,18 @@
 """The demo: the embedded recording, and the closed loop whose truth is known."""
 
 import html
+import io
 import json
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial import cKDTree
 
+import cellquant as cq
 from cellquant.closed_loop import (
     QUANTITIES,
     SMOOTHED,
@@ -18,6 +22,7 @@ from cellquant.closed_loop import (
     closed_loop_table,
 )
 from cellquant.demo import demo_scene, run_demo
+from cellquant.tables import read_tracks
 
 
 @pytest.fixture(scope="module")
@@ -46,34 +51,157 @@ def test_what_the_demo_says_of_the_recording_is_true(demo: Path) -> None:
     )
 
 
+def test_names_on_the_page_are_unique(demo: Path) -> None:
+    page = (demo / "report.html").read_text(encoding="utf-8")
+    for names in (re.findall(r' id="([^"]*)"', page), re.findall(r' download="([^"]*)"', page)):
+        assert len(names) > 8
+        assert len(names) == len(set(names))
+
+
 def numbers_in(content: object) -> list[float]:
-    """Every number of a JSON document."""
+    """Every number of a JSON document, those within its texts included."""
     if isinstance(content, dict):
-        content = list(content.values())
+        content = [*content, *content.values()]
     if isinstance(content, list):
         return [number for item in content for number in numbers_in(item)]
+    if isinstance(content, str):
+        return [float(text) for text in re.findall(NUMBER, content)]
     return [float(content)] if isinstance(content, int | float) else []
 
 
-def test_every_number_of_the_tables_stands_in_a_file_beside_the_page(demo: Path) -> None:
+NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
+FILES = (
+    "run.json",
+    "layer/closed_loop.json",
+    "layer/run.zarr/zarr.json",
+    "layer/found/summary.json",
+    "layer/truth/summary.json",
+    "recording/inspection.json",
+    "recording/run.json",
+    "recording/summary.json",
+)
+# What the texts say of shapes, rules and drawings, not of these layers.
+GENERAL = {
+    "3.54 for a disc", "3.72 for a regular hexagon", "The area under each curve is 1",
+    "the area under the curve is 1", "falls from 1 to 0", "The dotted line is 1/e",
+    "the line 1/e", "reaches 1/e", "τα) = 1/e", "q = 2π/d", "⟨√(4A/π)⟩", "MSD/(4t)", "exp(−r2/σ2)",
+    "third standardised moment", "A square of 8 by 8 cell diameters", "one half",
+    "below 1/e", "drawing counts from 1", "nowhere exceeds 1", "phi0", "t0", "v0", "L0", "σ2", "d2",
+    "χ4", "α2", "px2", "T98G", "SHA-256",
+}  # fmt: skip
+
+
+def visible_lines(page: str) -> list[str]:
+    """The text of the page, one piece a line, without drawings, downloads and scripts."""
+    body = page[page.index("<body") : page.index("<script", page.index("<body"))]
+    body = re.sub(r"<svg.*?</svg>", "", body, flags=re.DOTALL)
+    body = re.sub(r"</(?:p|li|h\d|tr|dt|dd|div|td|th|span)>", "\n", body)
+    text = html.unescape(re.sub(r"<[^>]*>", "", body)).replace("\N{MINUS SIGN}", "-")
+    return [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def in_tables_of(demo: Path, tracks: pd.DataFrame) -> list[float]:
+    """What the captions count or average over the tables of the recording."""
+    cells = pd.read_parquet(demo / "recording" / "cells.parquet")
+    steps = tracks.groupby("track_id")[["frame", "x", "y"]].diff().query("frame == 1")
+    step = float(np.median(np.hypot(steps["x"], steps["y"])))
+    apart = float(np.median(np.concatenate([
+        cKDTree(frame[["x", "y"]]).query(frame[["x", "y"]], k=2)[0][:, 1]
+        for _, frame in tracks.groupby("frame")
+    ])))  # fmt: skip
+    return [*cells.groupby("frame").size().astype(float), step, apart, step / apart]
+
+
+def test_every_number_of_the_text_stands_in_a_file_beside_the_page(demo: Path) -> None:
     page = (demo / "report.html").read_text(encoding="utf-8")
-    tables = re.findall(r"<table.*?</table>", page, flags=re.DOTALL)
-    assert len(tables) == 3
+    known = np.array([n for f in FILES for n in numbers_in(json.loads((demo / f).read_text()))])
+    known = np.unique(np.concatenate([known, -known]))
+    # Shares are shown in per cent, densities per million square pixels.
+    known = np.concatenate([known, 100 * known, 1e6 * known])
+    tracks = read_tracks(demo / "recording" / "tracks.parquet")
+    made = numbers_in(json.loads(json.dumps(dict(tracks.provenance))))
+    known = np.concatenate([known, made, in_tables_of(demo, tracks.table)])
+    missing = []
     checked = 0
-    for table, source in zip(
-        tables, ("layer/closed_loop.json",) * 2 + ("recording/summary.json",), strict=True
+    for line in visible_lines(page):
+        for phrase in GENERAL:
+            line = line.replace(phrase, "")
+        for number in re.findall(NUMBER, line.replace("\N{NARROW NO-BREAK SPACE}", "")):
+            digits = len(number.partition("e")[0].partition(".")[2])
+            checked += 1
+            if np.abs(known - float(number)).min() > 0.501 * 10.0**-digits:
+                missing.append((number, line[:120]))
+    assert missing == []
+    assert checked > 200
+
+
+def test_every_number_behind_a_drawing_stands_in_a_table_beside_the_page(demo: Path) -> None:
+    page = (demo / "report.html").read_text(encoding="utf-8")
+    numbers = {
+        name: pd.read_csv(io.StringIO(unquote(html.unescape(data))))
+        for name, data in re.findall(
+            r'download="([^"]*)\.csv" href="data:text/csv[^,]*,([^"]*)"', page
+        )
+    }
+    sides = {"Experiment: measured on masks": "found", "Simulation: known truth": "truth"}
+    summaries = {
+        stage: json.loads((demo / "layer" / stage / "summary.json").read_text())
+        for stage in sides.values()
+    }
+
+    def same(shown: pd.Series, told: pd.Series) -> None:
+        np.testing.assert_allclose(shown, told, rtol=1e-5)
+
+    # The closed loop: each side's table, in units of its own relaxation time and diameter.
+    for name, file, column, axis in (
+        ("loop-shape-index", "shape_index", "shape_index", None),
+        ("loop-self-intermediate-scattering", "self_intermediate_scattering", "lag_time", "tau"),
+        ("loop-mean-square-displacement", "msd", "lag_time", "tau"),
+        ("loop-van-hove", "van_hove", "r", None),
     ):
-        known = np.array(numbers_in(json.loads((demo / source).read_text())))
-        # Shares are shown in per cent, densities per million square pixels.
-        known = np.concatenate([known, 100 * known, 1e6 * known])
-        for cell in re.findall(r'<td[^>]*class="number"[^>]*>(.*?)</td>', table, flags=re.DOTALL):
-            text = html.unescape(re.sub("<.*?>", "", cell)).replace("\N{MINUS SIGN}", "-")
-            for number in re.findall(r"-?\d+(?:\.\d+)?", text):
-                digits = len(number.partition(".")[2])
-                distance = np.abs(known - float(number)).min()
-                assert distance <= 0.501 * 10.0**-digits, (source, text)
-                checked += 1
-    assert checked > 60
+        for side, stage in sides.items():
+            shown = numbers[name][numbers[name]["result"] == side]
+            table = pd.read_parquet(demo / "layer" / stage / f"{file}.parquet")
+            if "scope" in table:
+                table = table[table["scope"] == "all"]
+            tau = summaries[stage]["tau_alpha"]["value"] if axis else 1.0
+            d = summaries[stage]["wave_number"]["mean_diameter"] if file == "msd" else 1.0
+            shown = shown.set_index(shown.columns[1]).dropna(subset=["value"])
+            table = table.set_index(table[column] / tau)
+            assert len(shown) > 5
+            places = np.abs(table.index.to_numpy()[None] - shown.index.to_numpy()[:, None])
+            row = table.iloc[places.argmin(axis=1)]
+            assert (places.min(axis=1) <= 1e-5 * np.abs(shown.index)).all()
+            same(shown["value"], row["value"] / d**2)
+            same(shown["std_error"].fillna(0), (row["std_error"] / d**2).fillna(0))
+    truth = cq.open_run(demo / "layer" / "run.zarr").to_tracks().table
+    found = read_tracks(demo / "layer" / "found" / "tracks.parquet").table
+    for drawing, (stage, table) in enumerate((("found", found), ("truth", truth)), start=1):
+        d = summaries[stage]["wave_number"]["mean_diameter"]
+        for name in ("loop-paths-whole", "loop-paths-close"):
+            shown = numbers[name][numbers[name]["drawing"] == drawing]
+            told = shown.merge(table, on=["track_id", "frame"], suffixes=("", "_told"))
+            assert len(told) == len(shown) > 100
+            for axis in "xy":
+                np.testing.assert_allclose(told[axis], told[f"{axis}_told"] / d, atol=6e-4)
+    # The recording: its own tables as they are.
+    folder = demo / "recording"
+    for name, file in (
+        ("self-intermediate-scattering", "self_intermediate_scattering"),
+        ("mean-square-displacement", "msd"),
+    ):
+        table = pd.read_parquet(folder / f"{file}.parquet")
+        if "scope" in table:
+            table = table[table["scope"] == "all"]
+        for column in ("lag_time", "value", "std_error"):
+            same(numbers[name][column], table[column].reset_index(drop=True))
+    tracks = read_tracks(folder / "tracks.parquet").table
+    for name in ("trajectories", "segmented-frame"):
+        told = numbers[name].merge(tracks, on=["track_id", "frame"], suffixes=("", "_told"))
+        assert len(told) > 40
+        same(told["x"], told["x_told"])
+    cells = tracks.groupby("frame").size()
+    assert numbers["density"]["n_cells"].tolist() == cells.tolist()
 
 
 LIMITS = {

@@ -83,7 +83,28 @@ def test_isolated_disc_is_drawn_exactly(tmp_path):
     assert len(rows) * 0.01**2 == pytest.approx(np.pi * 0.25, rel=5e-3)
 
 
+def test_with_a_margin_the_layer_is_seen_once_more_and_each_cell_whole(run, rendered, tmp_path):
+    wide = render(run, tmp_path / "masks.tif", pixel_size=0.4, margin=1.5)
+    height, width = rendered.shape
+    assert wide.shape == tuple(int((side + 1.5) / 0.04) for side in run.box[::-1])
+    first, narrow = read_labels(wide.masks)[0], read_labels(rendered.masks)[0]
+    # What is drawn is the same layer, the strip beyond the box that on the other side.
+    assert np.array_equal(first[:height, :width] > 0, narrow > 0)
+    side = run.box[0] / 0.04
+    strip = first[:height, round(side) : round(side) + 30] > 0
+    assert (strip == (narrow[:, :30] > 0)).mean() > 0.97
+    whole = wide.tracks.table.query("frame == 0 and not touches_border")
+    assert len(whole) >= run.scene.n_cells
+    assert len(rendered.tracks.table.query("frame == 0 and not touches_border")) < 20
+    box = np.array(run.box) * 10
+    places = np.round(whole[["x", "y"]].to_numpy() % box, 3)
+    assert len(np.unique(places, axis=0)) == run.scene.n_cells
+
+
 def test_wrong_options_are_refused(run, tmp_path):
-    for options in ({"pixel_size": 0.0}, {"pixel_size": 5.0}, {"pixel_size": 0.4, "start": 99}):
+    for options in (
+        {"pixel_size": 0.0}, {"pixel_size": 5.0}, {"pixel_size": 0.4, "start": 99},
+        {"pixel_size": 0.4, "margin": -1.0}, {"pixel_size": 0.4, "margin": 99.0},
+    ):  # fmt: skip
         with pytest.raises(InputError):
             render(run, tmp_path / "masks.tif", **options)

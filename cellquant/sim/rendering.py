@@ -119,6 +119,7 @@ def render(
     time: float = 1.0 / 6.0,
     phase_contrast: str | Path | None = None,
     truth: str | Path | None = None,
+    margin: float = 0.0,
     start: int = 0,
     stop: int | None = None,
     step: int = 1,
@@ -126,11 +127,12 @@ def render(
 ) -> Rendering:
     """Render a run as label masks, as a camera would see it, with its true tracks.
 
-    The field of view is the periodic box, cut at its edges. A cell across an edge shows its two
-    parts on opposite sides, with labels of their own, as two cells that leave and enter; parts
-    below 8 pixels are not drawn. A pixel inside several cells goes to the one in which it
-    lies relatively deepest: the smallest r / R(phi) from the cell's centre. Labels are numbered
-    per frame by position in the field, so that they tell nothing of identity.
+    The field of view is the periodic box, with a margin where one is given, cut at its edges. A
+    cell across an edge shows its two parts on opposite sides, with labels of their own, as two
+    cells that leave and enter; parts below 8 pixels are not drawn. A pixel inside several cells
+    goes to the one in which it lies relatively deepest: the smallest r / R(phi) from the cell's
+    centre. Labels are numbered per frame by position in the field, so that they tell nothing of
+    identity.
 
     Parameters
     ----------
@@ -148,6 +150,9 @@ def render(
         A TIFF for a movie that looks like phase contrast (8 bit), or None.
     truth
         Folder of the true tracks and contours; None for `output` with ``_truth`` appended.
+    margin
+        Width of the strip to the right of the box and below it, in L0, in which the layer is seen
+        once more: with that of a cell nearly every cell is whole somewhere in the field.
     start, stop, step
         Frames of the run to render.
 
@@ -170,8 +175,13 @@ def render(
             f"{run.path or 'the run'} holds {run.n_frames} frames, none of them from {start} to "
             f"{stop} in steps of {step}; choose others."
         )
+    if not 0.0 <= margin <= min(run.box):
+        raise InputError(
+            f"margin must be >= 0 L0 and at most the box, {min(run.box):g} L0, got {margin}; "
+            "correct it."
+        )
     pixel = pixel_size / length
-    width, height = int(run.box[0] / pixel), int(run.box[1] / pixel)
+    width, height = (int((side + margin) / pixel) for side in run.box)
     if 2.0 * float(np.median(run.radius)) < 4.0 * pixel:
         raise InputError(
             f"a pixel of {pixel_size:g} um is too coarse for cells of "
@@ -182,7 +192,7 @@ def render(
             f"a field of {width} x {height} pixels is too large; take a larger pixel_size."
         )
     folder = Path(truth) if truth is not None else output.with_name(output.stem + "_truth")
-    painter = _Painter(run, pixel, (height, width))
+    painter = _Painter(run, pixel, (height, width), margin)
     masks: list[Labels] = []
     tables: list[pd.DataFrame] = []
     outlines: list[NDArray[np.float32]] = []
@@ -215,8 +225,8 @@ def render(
 class _Painter:
     """Draws frames of a run; keeps which part of which cell is in the field since when."""
 
-    def __init__(self, run: Run, pixel: float, shape: tuple[int, int]) -> None:
-        self.run, self.pixel, self.shape = run, pixel, shape
+    def __init__(self, run: Run, pixel: float, shape: tuple[int, int], margin: float) -> None:
+        self.run, self.pixel, self.shape, self.margin = run, pixel, shape, margin
         rng = np.random.default_rng([run.scene.seed, 3])
         n_cells = len(run.radius)
         waves = rng.normal(0.0, 6.0, (n_cells, 5))
@@ -279,7 +289,7 @@ class _Painter:
         size = np.sqrt(np.sum(state[:, 3:] ** 2, axis=1))
         spread = math.sqrt(max(1, state.shape[1] - 3))
         reach = HALO * self.run.radius * (1.0 + spread * size)
-        low = np.floor((state[:, :2] - reach[:, None]) / box).astype(np.int64)
+        low = np.floor((state[:, :2] - reach[:, None] - self.margin) / box).astype(np.int64)
         high = np.floor((state[:, :2] + reach[:, None]) / box).astype(np.int64)
         found = [
             (i, ix, iy)
