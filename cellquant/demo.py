@@ -166,8 +166,9 @@ _STEP_TEXTS = (
     "Frame interval: the camera sees one state in five that the run saved; what happens in between "
     "is not seen.",
     "Field of view: cells that the edge cuts are left out. The camera sees one cell diameter more "
-    "than the periodic layer, so that nearly every cell is whole in one place; what remains is the "
-    "difference between a sample and the whole, not a fault of the measurement.",
+    "than the periodic layer, so that nearly every cell is whole in one place. Cells that move far "
+    "leave the field more often than others, and tracks that are cut short are left out: a window "
+    "shows a sample of the motion, however well it is measured.",
     "Pixels: cells are drawn on a grid, and where two overlap each pixel goes to one of them.",
     "Linking: cells that were followed wrongly from frame to frame.",
 )

@@ -211,15 +211,27 @@ LIMITS = {
     "MSD at the relaxation time": 0.03,
     "relaxation time": 0.05,
 }
+HIDDEN = ("mean speed", "MSD at the relaxation time", "relaxation time")
 
 
-def check_loop(table: pd.DataFrame) -> None:
-    """The limits within which a layer must be recovered at 15 px radius, 10 frames per tau."""
+def check_loop(table: pd.DataFrame, side: float) -> None:
+    """The limits within which a layer must be recovered at 15 px radius, 10 frames per tau.
+
+    Motion has an allowance for the window, `side` diameters wide: displacements x, y are lost
+    with a chance of (|x| + |y|) / side, which takes about 0.25 / side off the MSD at the relaxation
+    time; tracks cut short at the edge are left out besides, so that the window sees a sample.
+    """
+    measured = (1 + table[["from_frame_interval", "from_pixels", "from_linking"]]).prod(axis=1) - 1
     for name, limit in LIMITS.items():
-        assert abs(table.loc[name, "error"]) < limit, name
+        row = table.loc[name]
+        assert abs(measured[name]) < limit, name
+        sampled = 0.5 * row["truth_std_error"] / row["truth"]
+        allowed = limit + (0.25 / side + sampled if name in HIDDEN else 0.0)
+        assert abs(row["error"]) < allowed, name
     for name in ("van Hove core σ²", "van Hove tail ξ"):
         row = table.loc[name]
-        assert abs(row["measured"] - row["truth"]) < row["measured_std_error"], name
+        stated = np.hypot(row["measured_std_error"], row["truth_std_error"])
+        assert abs(row["measured"] - row["truth"]) < stated, name
     steps = [name for name in table.columns if name.startswith("from_")]
     shares = np.prod(1 + table[steps].to_numpy(), axis=1) - 1
     assert shares == pytest.approx(table["error"].to_numpy(), abs=1e-12)
@@ -229,13 +241,14 @@ def check_loop(table: pd.DataFrame) -> None:
     assert table.loc["MSD at the relaxation time", "smoothing_adds"] < -0.02
     assert table.loc["relaxation time", "smoothing_adds"] > 0.01
     for name in ("MSD at the relaxation time", "relaxation time"):
-        assert abs(table.loc[name, "error_smoothed"]) < 1.3 * LIMITS[name], name
+        shift = table.loc[name, "error_smoothed"] - table.loc[name, "error"]
+        assert abs(shift) < 0.02, name
     assert (table.loc[["mean shape index", "mean diameter"], "smoothing_adds"] == 0).all()
 
 
 def test_the_closed_loop_recovers_the_truth(demo: Path) -> None:
     table = pd.DataFrame(json.loads((demo / "layer" / "closed_loop.json").read_text()))
-    check_loop(table.set_index("quantity"))
+    check_loop(table.set_index("quantity"), 16)
 
 
 def test_the_table_splits_the_error() -> None:
@@ -265,7 +278,8 @@ def test_the_table_splits_the_error() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("seed", [1, 3, 5])
 def test_a_larger_layer_is_recovered_closely(tmp_path: Path, seed: int) -> None:
     scene = demo_scene(seed).model_copy(update={"cells": 400, "duration": 420})
-    check_loop(close_loop(scene, tmp_path).table.set_index("quantity"))
+    check_loop(close_loop(scene, tmp_path).table.set_index("quantity"), 20)
