@@ -202,6 +202,14 @@ def test_one_censored_trial_leaves_only_a_bound(study: Path, tmp_path: Path) -> 
     assert "1 censored" in tau.n
 
 
+def test_a_bound_stands_where_a_number_was_not_reached(movie, model, tmp_path: Path) -> None:
+    slow = model.result("slow")
+    slow.summary["tau_alpha"] = {"value": None, "std_error": None, "censored_at": 512.0}
+    cq.compare(movie.result("movie"), slow).to_html(tmp_path / "r.html")
+    row = (tmp_path / "r.html").read_text().split("Relaxation time τ<sub>α</sub></th>")[1]
+    assert "&gt; 512 t<sub>0</sub>" in row.split("</tr>")[0]
+
+
 def test_study_against_sweep(study: Path, sweep: Path, tmp_path: Path) -> None:
     comparison = cq.compare(study, sweep)
     assert len(comparison.experiments) == 2
@@ -284,7 +292,7 @@ def test_samples_and_units_stand_beside_the_numbers(study: Path, model, tmp_path
     comparison = cq.compare(study, model.result("model"))
     comparison.to_html(tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    text = html.unescape(re.sub("<.*?>", "", page))
+    text = html.unescape(re.sub("<.*?>", "", page)).replace("\N{NO-BREAK SPACE}", " ")
     assert "3 trials" in text
     assert "1 run" in text
     tau = comparison.groups[0].scalars()["tau_alpha.value"]

@@ -97,9 +97,10 @@ _SHAPE = (
 )
 _RELAXATION = (
     "F_{s}(q, t) tells how much of the layer is still where it was, at the scale of a cell. Time "
-    "is given in units of each side's own relaxation time τ_{α}, the mean over its trials: a "
-    "single recording falls to 1/e at 1, a mean over trials close to it. What is compared is the "
-    "form of the curves; the scale above each drawing gives the side's own unit of time.",
+    "is given in units of each side's own relaxation time τ_{α}, the mean over its trials. A "
+    "single recording falls to 1/e at 1; a mean over recordings that relax at different times need "
+    "not, since the fast ones fall first. What is compared is the form of the curves; the scale "
+    "above each drawing gives the side's own unit of time.",
 )
 _MOTION = ("Distances are in units of the mean cell diameter d, times in units of τ_{α}.",)
 _MAPS = (

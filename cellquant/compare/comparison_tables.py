@@ -17,7 +17,7 @@ from cellquant.compare.groups import Group
 from cellquant.compare.matching import Matched, matched_scalars
 from cellquant.compare.page import Row, Section, Table, format_value
 from cellquant.compare.report import scalar_text
-from cellquant.compare.results import look_up, pretty_unit
+from cellquant.compare.results import Scalar, look_up, pretty_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,6 +90,7 @@ def _overview_table(pairs: Pairs) -> Table:
 
 
 def _verdict_table(index: int, first: Group, second: Group, verdicts: Sequence[Verdict]) -> Table:
+    bounds = [group.scalars() for group in (first, second)]
     tones = {AGREE: "good", DIFFER: "bad", NOT_COMPARABLE: "none"}
     rows = []
     for verdict in sorted(verdicts, key=lambda v: v.verdict == NOT_COMPARABLE):
@@ -105,8 +106,10 @@ def _verdict_table(index: int, first: Group, second: Group, verdicts: Sequence[V
             Row(
                 (
                     verdict.label,
-                    _with_unit(a),
-                    _with_unit(b),
+                    *(
+                        _with_unit(v, known.get(v.key))
+                        for v, known in zip((a, b), bounds, strict=True)
+                    ),
                     difference,
                     words,
                 ),
@@ -123,9 +126,12 @@ def _verdict_table(index: int, first: Group, second: Group, verdicts: Sequence[V
     )
 
 
-def _with_unit(matched: Matched) -> str:
-    value = format_value(matched.value, matched.std_error)
-    return f"{value} {matched.unit}" if matched.unit and math.isfinite(matched.value) else value
+def _with_unit(matched: Matched, scalar: Scalar | None) -> str:
+    """Value, error and unit; the bound of a number that was not reached."""
+    value, known = format_value(matched.value, matched.std_error), math.isfinite(matched.value)
+    if not known and scalar is not None and math.isfinite(scalar.censored_at):
+        value, known = scalar_text(scalar), True
+    return f"{value} {matched.unit}" if matched.unit and known else value
 
 
 def sides_section(groups: Sequence[Group]) -> Section:
@@ -146,7 +152,9 @@ def sides_section(groups: Sequence[Group]) -> Section:
             Row(
                 (
                     group.name,
-                    counted(group.n, "run" if group.simulated else "trial"),
+                    counted(group.n, "run" if group.simulated else "trial").replace(
+                        " ", "\N{NO-BREAK SPACE}"
+                    ),
                     str(len(group.members)),
                     _range([s.get("n_frames") for s in summaries]),
                     "–" if step is None else f"{step:g} {pretty_unit(units.time)}",

@@ -10,7 +10,7 @@ from cellquant.compare.figures import Curve, Mark, Scale, draw_curves
 from cellquant.compare.groups import Group
 from cellquant.compare.inference import Posterior, fit_parameters, sensitivity
 from cellquant.compare.page import MINUS, Figure, Panel, Row, Section, Table, format_value
-from cellquant.compare.ranking import REDUCED_UNITS, Ranking, Units, rank_candidates
+from cellquant.compare.ranking import MATCH, REDUCED_UNITS, Ranking, Units, rank_candidates
 from cellquant.errors import InputError
 
 if TYPE_CHECKING:
@@ -167,7 +167,12 @@ def _ranking_table(index: int, ranking: Ranking) -> Table:
     import pandas as pd
 
     shown = ranking.ranks[:MAX_ROWS]
-    close = {id(rank) for rank in ranking.not_distinguishable}
+    close = len(ranking.not_distinguishable)
+    others = {id(rank) for rank in ranking.not_distinguishable[1:]}
+    words = ["closest" if close == 1 else "closest, but not alone", *[""] * (len(shown) - 1)]
+    words = [
+        "not distinguishable" if id(r) in others else w for r, w in zip(shown, words, strict=True)
+    ]
     rows = tuple(
         Row(
             (
@@ -175,11 +180,11 @@ def _ranking_table(index: int, ranking: Ranking) -> Table:
                 f"{rank.distance:.2f}",
                 f"{rank.best_probability:.0%}",
                 f"{rank.interval[0]} to {rank.interval[1]}",
-                "not distinguishable from the closest" if id(rank) in close else "",
+                word if not word or rank.distance <= MATCH else f"{word}; does not match",
             ),
-            "good" if id(rank) in close else "none",
+            "good" if word and rank.distance <= MATCH else "none",
         )
-        for rank in shown
+        for rank, word in zip(shown, words, strict=True)
     )
     more = len(ranking.ranks) - len(shown)
     data = pd.DataFrame(

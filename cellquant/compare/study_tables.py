@@ -69,7 +69,10 @@ def statistics_section(study: Study, *, number: int = 1) -> Section:
     if statistics["mann_whitney"]:
         tables.append(_tests(statistics["mann_whitney"]))
     if statistics["mixed_model"]:
-        tables.append(_trends(statistics["mixed_model"], study.units))
+        models = statistics["mixed_model"]
+        order = [c for c in dict.fromkeys(study.trials["condition"]) if c in models]
+        order += [c for c in models if c not in order]
+        tables.append(_trends({c: models[c] for c in order}, study.units))
     suffix = "" if number == 1 else f"-{number}"
     return Section(
         f"conditions{suffix}",
