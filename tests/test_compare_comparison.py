@@ -5,6 +5,7 @@ import json
 import math
 import re
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
@@ -200,6 +201,21 @@ def test_one_censored_trial_leaves_only_a_bound(study: Path, tmp_path: Path) -> 
     assert math.isnan(tau.value)
     assert tau.censored_at == 500.0
     assert "1 censored" in tau.n
+
+
+def test_a_whole_study_is_made_again_by_one_command(study: Path, movie, tmp_path: Path) -> None:
+    folder = tmp_path / "a study"
+    shutil.copytree(study, folder)
+    record = json.loads((folder / "run.json").read_text())
+    record |= {"command": "run", "inputs": {"hela.toml": "0"}}
+    (folder / "run.json").write_text(json.dumps(record))
+    alone = movie.write(tmp_path / "alone")
+    cq.compare(folder, alone).to_html(tmp_path / "r.html")
+    page = html.unescape((tmp_path / "r.html").read_text())
+    commands = page.split('aria-label="Commands">')[1].split("</pre>")[0].splitlines()
+    assert commands[0] == f"cellquant run hela.toml -o {shlex.quote(str(folder))}"
+    assert commands[-1].startswith("cellquant compare")
+    assert not any("stacks" in line for line in commands[1:-1])
 
 
 def test_a_bound_stands_where_a_number_was_not_reached(movie, model, tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """The page of a comparison: pairs of figures with the same axes, verdicts, units, methods."""
 
+import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from cellquant.compare.comparison import LEVEL, Comparison
 from cellquant.compare.comparison_tables import (
@@ -38,7 +40,7 @@ from cellquant.compare.page import (
     flatten,
     format_value,
 )
-from cellquant.compare.report import methods_section
+from cellquant.compare.report import command_lines, methods_section
 from cellquant.compare.study_figures import (
     boxes_figure,
     crowding_figure,
@@ -171,14 +173,39 @@ def command_of(comparison: Comparison) -> str:
     return shlex.join(words)
 
 
+def _whole_commands(comparison: Comparison) -> dict[Path, str]:
+    """By folder of a whole study or sweep among the sources, the command that makes it again."""
+    found = {}
+    for source in comparison.settings.get("sources", ()):
+        try:
+            record = json.loads((Path(source) / "run.json").read_text("utf-8"))
+        except (OSError, ValueError):
+            continue
+        files = [name for name in record.get("inputs", {}) if name.endswith(".toml")]
+        if record.get("command") in {"run", "sweep"} and files:
+            words = ["cellquant", record["command"], files[0], "-o", source]
+            found[Path(source).resolve()] = shlex.join(words)
+    return found
+
+
 def _methods(comparison: Comparison, groups: Sequence[Group]) -> Section:
     recorded = [(g.name, g.members[0].record) for g in groups if g.members[0].record]
     section = methods_section(recorded[:MAX_TABLES])
+    whole = _whole_commands(comparison)
+    parts = {
+        line
+        for group in groups
+        for folder in [group.members[0].folder]
+        if folder is not None and any(w in folder.resolve().parents for w in whole)
+        for record in [*group.members[0].record.get("earlier", []), group.members[0].record]
+        for line in command_lines(record)
+    }
+    single = [line for line in section.commands.splitlines() if line not in parts]
     made = {"level": f"{LEVEL:g} combined standard errors", **comparison.settings}
     section = replace(
         section,
         settings=(Settings("Settings of compare", flatten(made)), *section.settings),
-        commands="\n".join(filter(None, (section.commands, command_of(comparison)))),
+        commands="\n".join(filter(None, (*whole.values(), *single, command_of(comparison)))),
     )
     more = len(recorded) - MAX_TABLES
     if more <= 0:
