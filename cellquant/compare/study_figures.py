@@ -86,10 +86,10 @@ def relaxation_figure(comparison: "Comparison") -> Figure | None:
     return Figure(
         name="relaxation-times",
         title="Relaxation against crowding",
-        caption="Each side in units of its own relaxation time at its lowest packing fraction; "
-        "the numbers behind the figure hold the values in the side's own unit. For movies φ is "
-        f"effective: density × {comparison.area[0]:.0f} ± {comparison.area[1]:.0f} µm^{{2}}, so that "
-        f"all of it may shift by {100 * comparison.area[1] / comparison.area[0]:.0f}\N{NO-BREAK SPACE}%.",
+        caption="Each side in units of its own relaxation time at its lowest packing fraction; the "
+        "numbers behind the figure hold the values in the side's own unit. For movies φ is "
+        f"effective: density × {comparison.area[0]:.0f} ± {comparison.area[1]:.0f} µm^{{2}}; all "
+        f"of it may shift by {100 * comparison.area[1] / comparison.area[0]:.0f}\N{NO-BREAK SPACE}%.",
         panels=tuple(panels),
         data=pd.concat(rows, ignore_index=True),
         wide=True,
