@@ -83,13 +83,14 @@ def relaxation_figure(comparison: "Comparison") -> Figure | None:
                 title,
             )
         )  # fmt: skip
+    mean, spread = comparison.area
     return Figure(
         name="relaxation-times",
         title="Relaxation against crowding",
         caption="Each side in units of its own relaxation time at its lowest packing fraction; the "
         "numbers behind the figure hold the values in the side's own unit. For movies φ is "
-        f"effective: density × {comparison.area[0]:.0f} ± {comparison.area[1]:.0f} µm^{{2}}; all "
-        f"of it may shift by {100 * comparison.area[1] / comparison.area[0]:.0f}\N{NO-BREAK SPACE}%.",
+        f"effective: density × {mean:.0f} ± {spread:.0f} µm^{{2}}; all of it may shift by "
+        f"{100 * spread / mean:.0f}\N{NO-BREAK SPACE}%.",
         panels=tuple(panels),
         data=pd.concat(rows, ignore_index=True),
         wide=True,
