@@ -149,17 +149,8 @@ def test_labels_carry_no_information() -> None:
         names.append(np.argsort(new))
     one = cq.track(stack_of(array)).table
     other = cq.track(stack_of(shuffled)).table
-    back = [names[f][n] for f, n in zip(other["frame"], other["label"], strict=True)]
-    key = other.assign(label=back)
-    paths = {
-        tuple(g[["frame", "label"]].itertuples(index=False, name=None))
-        for _, g in one.groupby("track_id")
-    }
-    same = {
-        tuple(g[["frame", "label"]].itertuples(index=False, name=None))
-        for _, g in key.groupby("track_id")
-    }
-    assert paths == same
+    other["label"] = [names[f][n] for f, n in zip(other["frame"], other["label"], strict=True)]
+    pd.testing.assert_frame_equal(other, one, check_exact=True)
 
 
 def test_same_input_gives_equal_tables() -> None:
@@ -339,7 +330,7 @@ def test_twenty_thousand_cells_per_frame_stay_bounded() -> None:
 
 @pytest.mark.parametrize(
     ("name", "edge", "division", "idf1"),
-    [("epidermis_area1", 0.96, 0.75, 0.86), ("cell_migration", 0.9997, 0.93, 0.994)],
+    [("epidermis_area1", 0.965, 0.75, 0.86), ("cell_migration", 0.9997, 0.93, 0.994)],
 )
 def test_real_recordings_with_shuffled_labels(
     recordings: Path, name: str, edge: float, division: float, idf1: float

@@ -1,6 +1,7 @@
 """Cells to tracks: the public entries, and what they report."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -82,7 +83,7 @@ def track_cells(
     Parameters
     ----------
     cells
-        Measured cells, rows by frame and label.
+        Measured cells. Their labels and the order of rows do not matter.
     masks
         The label masks that were measured. Not needed for linking by centroid and moments.
     raw
@@ -131,6 +132,7 @@ def track_cells(
             f"none of the {cells.n_frames} frames holds a cell; "
             "check that these are label masks and not the raw movie."
         )
+    cells = _by_place(cells)
     movie = flatten(cells)
     after = np.full(movie.n_cells, -1, dtype=np.int64)
     second, confidence = after.copy(), np.full(movie.n_cells, np.nan)
@@ -178,6 +180,13 @@ def track_cells(
         area=float(np.mean(cells.occupied_area)),
         provenance=report,
     )
+
+
+def _by_place(cells: Cells) -> Cells:
+    """The cells of each frame in the order of their places: no result depends on their labels."""
+    table = cells.table
+    order = np.lexsort((table["label"], table["x"], table["y"], table["frame"]))
+    return replace(cells, table=table.iloc[order].reset_index(drop=True))
 
 
 def number_tracks(after: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:

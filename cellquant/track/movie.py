@@ -20,7 +20,7 @@ LOG_AREA = 0  # column of Movie.shape
 
 @dataclass(frozen=True)
 class Movie:
-    """Cells of a movie, in order of frame and label.
+    """Cells of a movie, in order of frame and place.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ def flatten(cells: Cells) -> Movie:
     Parameters
     ----------
     cells
-        Table ordered by frame and label.
+        Table ordered by frame.
 
     Returns
     -------
