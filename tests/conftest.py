@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import numba
 import pytest
 from hypothesis import settings
 
@@ -11,6 +12,13 @@ from hypothesis import settings
 settings.register_profile("quick", derandomize=True)
 settings.register_profile("thorough", max_examples=500, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Two test processes share two cores; what several threads do is asked for where it matters."""
+    numba.set_num_threads(1)
+
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
