@@ -27,8 +27,8 @@ What these runs say, and what they do not:
 - At equal age (mean of 150 to 300 t0, N = 100, one seed, phi 0.97) <p> = 3.649, 3.686, 3.932 for
   v0 = 0.01, 0.03, 0.07 (the last to 225 t0) and 3.686, 3.638, 3.607 for eta = 0.01, 0.03, 0.08:
   it grows with v0 and falls with eta, as published.
-- The run of seed 1 at N = 256 passed a pinched cell at 945 t0 (p = 5.6 of that cell); its waist opened
-  again.
+- The run of seed 1 at N = 256 passed a pinched cell at 945 t0 (p = 5.6 of that cell); its waist
+  opened again.
 """
 
 
