@@ -111,7 +111,7 @@ def trembling_lattice(tally: Tally, seed: int) -> None:
     one_of_each = ~((q_x[:, None] == 0) & (q_y[None] < 0))
     # Not shell 5, half way to the first Bragg peak: q and G - q lie in it together and measure the
     # same waves, so that there are fewer independent values than vectors (the interval holds the
-    # truth 92 times in 100).
+    # truth 90 to 92 times in 100).
     for shell in (3, 6, 8):
         inside = (np.floor(q / step.max() - 0.5) == shell) & one_of_each & (q <= 6.5)
         truth = float(np.mean(1 - np.exp(-((q[inside] * 0.15) ** 2))))
