@@ -7,11 +7,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from numba.core.registry import CPUDispatcher
 
 import cellquant
+from cellquant.sim.parts import Shared
 
 SIMULATE = """
 import hashlib
@@ -20,9 +22,12 @@ import numpy as np
 import cellquant as cq
 
 def simulate(**fields):
-    run = cq.simulate(cq.Scene(phi=0.95, n_cells=16, **fields), duration=20, seed=1)
+    run = cq.simulate(cq.Scene(phi=0.95, n_cells=16, **fields), duration=40, seed=1)
     names = sorted(run._group.array_keys())
     data = b"".join(np.ascontiguousarray(run._group[name][:]).tobytes() for name in names)
+    measured = cq.observe(run)
+    data += repr(measured.summary).encode()
+    data += b"".join(table.to_csv().encode() for table in measured.tables.values())
     return hashlib.sha1(data).hexdigest()
 
 scenes = {"active": {}, "passive": {"v0": 0.0, "D_r": 0.0, "eta": 0.0}}
@@ -31,17 +36,16 @@ for name in sys.argv[1:]:
 """
 
 
-def kernels() -> Iterator[tuple[str, CPUDispatcher]]:
+def compiled(kind: type) -> Iterator[Any]:
     for module in pkgutil.walk_packages(cellquant.__path__, "cellquant."):
         if module.name.endswith("__main__"):
             continue
-        for name, value in vars(importlib.import_module(module.name)).items():
-            if isinstance(value, CPUDispatcher) and value.py_func.__module__ == module.name:
-                yield f"{module.name}.{name}", value
+        for value in vars(importlib.import_module(module.name)).values():
+            if isinstance(value, kind):
+                yield value
 
 
-def parts(kernel: CPUDispatcher) -> Iterator[CPUDispatcher]:
-    function = kernel.py_func
+def parts(function: Any) -> Iterator[CPUDispatcher]:
     for name in function.__code__.co_names:
         if isinstance(value := function.__globals__.get(name), CPUDispatcher):
             yield value
@@ -52,9 +56,11 @@ def test_a_kernel_calls_no_loosely_compiled_code_of_another() -> None:
 
     Where its arithmetic may be reordered, the copies differ in the last digit.
     """
-    found = dict(kernels())
-    assert len(found) > 50
-    called = {part for kernel in found.values() for part in parts(kernel)}
+    shared = {kernel.function for kernel in compiled(Shared)}
+    assert len(shared) > 5
+    alone = {kernel.py_func for kernel in compiled(CPUDispatcher)}
+    assert len(alone) > 50
+    called = {part for function in shared | alone for part in parts(function)}
     assert len(called) > 20
     loose = [part for part in called if part.targetoptions.get("fastmath")]
     assert len(loose) > 10
@@ -65,6 +71,18 @@ def test_a_kernel_calls_no_loosely_compiled_code_of_another() -> None:
         and part.targetoptions.get("inline") != "always"
     ]
     assert not outside, f"add forceinline=True to {outside}"
+
+
+def test_loosely_compiled_work_on_a_layer_is_shared_by_address() -> None:
+    """The body of a parallel loop is compiled several times over: see `cellquant.sim.parts`."""
+    loops = [
+        kernel.py_func.__name__
+        for kernel in compiled(CPUDispatcher)
+        if kernel.py_func.__module__.startswith("cellquant.sim")
+        and kernel.targetoptions.get("parallel")
+        and kernel.targetoptions.get("fastmath")
+    ]
+    assert not loops, f"make {loops} shared"
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from cellquant.sim import (
     neighbours,
     outlines,
     overlaps,
+    parts,
     pinches,
     quadrature,
 )
@@ -100,6 +101,7 @@ class Layer:
         else:
             self._rho = np.zeros((n_cells, size))
             self._slope = np.zeros((n_cells, size))
+        self._addresses: dict[parts.Shared, int] = {}
         self._reference: Floats | None = None
         self._capacity = 6 * n_cells + 64
         self._n_blocks = -(-n_cells // outlines.BLOCK)
@@ -120,53 +122,42 @@ class Layer:
         SimulationFailure
             If a contour is not representable (a0^2 <= 0), or a number is not finite.
         """
+        for array in (state, out):  # compiled code is given their addresses
+            if array.dtype != np.float64 or not array.flags.c_contiguous:
+                raise ValueError("a state must be a C-contiguous array of float64")
         self.evaluations += 1
         self._prepare(state, self._tension if self.contact == "exact" else ())
         common = (self._first, self._other, self._shift)
         back = (self._back_first, self._back_pair, self._back_cell)
         if self.scene.rigid:
-            discs.rigid_velocity(
-                state, self.radius, *common, *back, self._numbers, out, self._energy
+            self._share(
+                discs.rigid_velocity,
+                (state, self.radius, *common, *back, self._numbers, out, self._energy),
             )
         elif self.contact == "exact":
             self._find_crossings()
-            overlaps.exact_velocity(
-                state,
-                self.radius,
-                self._record,
-                self._tangent,
-                self._first,
-                self._other,
-                *back,
-                self._roots,
-                self._root_first,
-                self._root_last,
-                self._sign,
-                self._inside,
-                self._numbers,
+            self._share(
+                overlaps.exact_velocity,
+                (
+                    state, self.radius, self._record, self._tangent, self._first, self._other,
+                    *back, self._roots, self._root_first, self._root_last, self._sign,
+                    self._inside, self._numbers, out, self._energy,
+                ),
                 self._modes,
                 self._tension,
                 self._torque,
-                out,
-                self._energy,
-                self._n_parts,
-            )
+            )  # fmt: skip
         else:
-            quadrature.quadrature_velocity(
-                state,
-                self.radius,
-                self._record,
-                self._rho,
-                self._slope,
-                self._table,
-                *common,
-                *back,
-                self._numbers,
+            self._share(
+                quadrature.quadrature_velocity,
+                (
+                    state, self.radius, self._record, self._rho, self._slope, self._table,
+                    *common, *back, self._numbers, out,
+                ),
                 self._modes,
                 self._tension,
                 self._torque,
-                out,
-            )
+            )  # fmt: skip
 
     def energies(self, state: Floats) -> Floats:
         """Energy of every cell: its tension and its share of the overlaps, by the exact rule."""
@@ -210,29 +201,20 @@ class Layer:
             self._record[:, :2] = state[:, :2]
             self._record[:, 2:5] = self.radius[:, None]
         elif self.contact == "exact":
-            outlines.contours(
-                state,
-                self.radius,
-                self._single,
-                self._quarter,
-                self._starts,
+            self._share(
+                outlines.contours,
+                (
+                    state, self.radius, self._single, self._quarter, self._starts, self._record,
+                    self._grid, self._pattern, self._tangent,
+                ),
                 self._modes,
                 tension,
-                self._record,
-                self._grid,
-                self._pattern,
-                self._tangent,
-                self._n_parts,
-            )
+            )  # fmt: skip
         else:
-            quadrature.sample_contours(
-                state,
-                self.radius,
-                self._table,
+            self._share(
+                quadrature.sample_contours,
+                (state, self.radius, self._table, self._record, self._rho, self._slope),
                 self._modes,
-                self._record,
-                self._rho,
-                self._slope,
             )
         fresh = self._reference is None
         reference = self._record[:, [0, 1, 3]] if self._reference is None else self._reference
@@ -247,6 +229,19 @@ class Layer:
             pinches.measure_lengths(self._record, self._narrow, len(self._modes), self._tangent)
         if fresh or age > 0.5 * self.skin:
             self._rebuild()
+
+    def _share(
+        self,
+        kernel: parts.Shared,
+        arrays: tuple[Any, ...],
+        modes: tuple[int, ...] = (),
+        tension: tuple[int, ...] = (),
+        torque: tuple[int, ...] = (),
+    ) -> None:
+        features = modes, tension, torque
+        if kernel not in self._addresses:
+            self._addresses[kernel] = kernel.address(arrays, *features)
+        parts.share(self._addresses[kernel], self._n_parts, arrays, *features)
 
     def _check(self, fault: int) -> None:
         if fault < 0:
@@ -310,25 +305,15 @@ class Layer:
             roots, sign = self._of_blocks
             if len(self._work[0]) < self._n_parts:
                 self._work = crossings.work(self._n_parts)
-            crossings.crossings(
-                self._record,
-                self._grid,
-                self._pattern,
-                self._circle,
-                self._table,
-                self._first,
-                self._other,
-                self._shift,
+            self._share(
+                crossings.crossings,
+                (
+                    self._record, self._grid, self._pattern, self._circle, self._table,
+                    self._first, self._other, self._shift, roots, self._root_first,
+                    self._root_last, sign, self._inside, self._fault, *self._work,
+                ),
                 self._modes,
-                roots,
-                self._root_first,
-                self._root_last,
-                sign,
-                self._inside,
-                self._fault,
-                *self._work,
-                self._n_parts,
-            )
+            )  # fmt: skip
             if self._fault.any():
                 self._allocate_roots(2 * self._room // self._n_blocks)
             elif (used := self._close_pinches()) > len(self._roots):

@@ -14,7 +14,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from cellquant.sim.grazes import FLAGS, HULL_MARGIN, gap, search_closely, settle
 from cellquant.sim.lanes import (
@@ -39,6 +39,7 @@ from cellquant.sim.lanes import (
     widen_pair,
 )
 from cellquant.sim.outlines import BLOCK, HEAD
+from cellquant.sim.parts import shared
 
 ROOT = 8  # columns of a root: unit vectors on i and on j, rho on i and on j, error, angle
 PAIRS = 32  # pairs whose contours are sampled before the gaps between samples are judged
@@ -466,30 +467,18 @@ def put(roots: Any, r: int, result: Any, g: int, sign: Any, value: float) -> Non
     sign[r] = value
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def search_part(
-    record: Any,
-    grid: Any,
-    pattern: Any,
-    circle: Any,
-    compass: Any,
-    first: Any,
-    other: Any,
-    shift: Any,
-    modes: Any,
-    roots: Any,
-    root_first: Any,
-    root_last: Any,
-    sign: Any,
-    inside: Any,
-    fault: Any,
-    work_rows: Any,
-    work_hints: Any,
-    work_result: Any,
-    part: int,
-    n_parts: int,
-) -> None:
-    """One part of `crossings`; here it is compiled once, inside a parallel loop twice."""
+@shared(FLAGS)
+def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any) -> None:
+    """Find where the contours of every listed pair cross.
+
+    `roots` has the same room for every block of cells; the crossings of pair p are the rows
+    root_first[p] to root_last[p]. `inside` is 1 where i lies in j, 2 where j lies in i. Every part
+    has its own work arrays (see `work`).
+    """
+    (
+        record, grid, pattern, circle, compass, first, other, shift, roots, root_first, root_last,
+        sign, inside, fault, work_rows, work_hints, work_result,
+    ) = arrays  # fmt: skip
     n_cells = record.shape[0]
     stride = record.shape[1]
     size = compass.shape[1]
@@ -661,58 +650,3 @@ def search_part(
                     compass[0, s], compass[1, s], hints[2, g], hints[3, g], result[g, 7],
                     sign[r], modes, roots, r,
                 )  # fmt: skip
-
-
-@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
-def crossings(
-    record: Any,
-    grid: Any,
-    pattern: Any,
-    circle: Any,
-    compass: Any,
-    first: Any,
-    other: Any,
-    shift: Any,
-    modes: Any,
-    roots: Any,
-    root_first: Any,
-    root_last: Any,
-    sign: Any,
-    inside: Any,
-    fault: Any,
-    work_rows: Any,
-    work_hints: Any,
-    work_result: Any,
-    n_parts: int,
-) -> None:
-    """Find where the contours of every listed pair cross.
-
-    `roots` has the same room for every block of cells; the crossings of pair p are the rows
-    root_first[p] to root_last[p]. `inside` is 1 where i lies in j, 2 where j lies in i. The blocks
-    are dealt out in `n_parts` parts, each with its own work arrays (see `work`); no result depends
-    on their number.
-    """
-    for part in prange(n_parts):
-        number: Any = np.int64(part)  # one type for all that is compiled
-        search_part(
-            record,
-            grid,
-            pattern,
-            circle,
-            compass,
-            first,
-            other,
-            shift,
-            modes,
-            roots,
-            root_first,
-            root_last,
-            sign,
-            inside,
-            fault,
-            work_rows,
-            work_hints,
-            work_result,
-            number,
-            n_parts,
-        )

@@ -3,28 +3,23 @@
 import math
 from typing import Any
 
-from numba import njit, prange
+from cellquant.sim.parts import shared
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 
 
-@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
+@shared(FLAGS)
 def rigid_velocity(
-    state: Any,
-    radius: Any,
-    first: Any,
-    other: Any,
-    shift: Any,
-    back_first: Any,
-    back_pair: Any,
-    back_cell: Any,
-    numbers: Any,
-    velocity: Any,
-    energy: Any,
+    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
 ) -> None:
     """Velocity and energy of rigid discs: the overlap of two circles is known in closed form."""
+    (
+        state, radius, first, other, shift, back_first, back_pair, back_cell, numbers, velocity,
+        energy,
+    ) = arrays  # fmt: skip
+    n_cells = state.shape[0]
     v0, k, eta, mu_r = numbers[0], numbers[1], numbers[2], numbers[3]
-    for i in prange(state.shape[0]):
+    for i in range(part * n_cells // n_parts, (part + 1) * n_cells // n_parts):
         fx = 0.0
         fy = 0.0
         area = 0.0

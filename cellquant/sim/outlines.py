@@ -15,7 +15,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from cellquant.sim.lanes import (
     LANES,
@@ -33,6 +33,7 @@ from cellquant.sim.lanes import (
     singles,
     store,
 )
+from cellquant.sim.parts import shared
 
 QUARTER_TURN, REST_OF_IT = 0.5 * math.pi, 6.123233995736766e-17
 GUESS = 0x5FE6EB50C7B537A9  # bits from which those of 1 / sqrt follow, to 3 %
@@ -399,61 +400,48 @@ def write_records(
         )  # fmt: skip
 
 
-@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
-def contours(
-    state: Any,
-    radius: Any,
-    compass: Any,
-    quarter: Any,
-    starts: Any,
-    modes: Any,
-    tension: Any,
-    record: Any,
-    grid: Any,
-    pattern: Any,
-    tangent: Any,
-    n_parts: int,
-) -> None:
+@shared(FLAGS)
+def contours(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any) -> None:
     """Record every contour and its samples; with tension also the gradient of its length.
 
     Writes `record`, the samples x, y and slope / rho of `grid` (N, 3, see
     `row_of_samples`) in single precision, relative to the centre, in `pattern` A0, the modes and
     n times the modes in single precision, and in `tangent` the length, L_0, then Re and Im of
     L_n = integral (u + i n v) exp(i n phi), u = rho / |t|, v = slope / |t|. The lower estimate of
-    rho is NaN where a0^2 <= 0. For `n_parts` see `crossings`.
+    rho is NaN where a0^2 <= 0.
     """
+    state, radius, compass, quarter, starts, record, grid, pattern, tangent = arrays
     n_modes = len(modes)
     n_cells = state.shape[0]
     size = compass.shape[1]
     spacing = 2.0 * math.pi / size
     n_blocks = (n_cells + BLOCK - 1) // BLOCK
-    for part in prange(n_parts):
-        lane = np.empty(QUAD * (1 + 2 * n_modes))
-        sums = np.empty(QUAD * (4 + 2 * n_modes))
-        rays = np.empty(8 * QUAD * POINTS)
-        extremes = np.empty(2 * LANES, np.float32)
-        places = np.empty(QUAD, np.int64)
-        columns = np.empty((8 + 4 * n_modes) * QUAD)
-        cells = np.empty(BLOCK, np.int64)
-        for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
-            end = min(n_cells, (block + 1) * BLOCK)
-            for begin in range(block * BLOCK, end, QUAD):
-                write_records(state, radius, begin, end, modes, record, places, columns)
-            for i in range(block * BLOCK, end):
-                mean = record[i, 2]
-                bend = record[i, 3]
-                if not mean > 0.0:
-                    continue
-                high, low = sample(i, record, compass, modes, grid, pattern, extremes)
-                # Between two samples the radius exceeds them by at most spacing^2/8 |rho''|.
-                record[i, 3] = high + SLACK * mean + 0.125 * spacing * spacing * bend
-                record[i, 4] = low - SLACK * mean
-            if len(tension) > 0:
-                count = 0
-                for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
-                    if record[i, 4] > 0.0:
-                        cells[count] = i
-                        count += 1
-                gradient_of_length(
-                    cells, count, lane, sums, record, quarter, starts, modes, tangent, rays
-                )
+    lane = np.empty(QUAD * (1 + 2 * n_modes))
+    sums = np.empty(QUAD * (4 + 2 * n_modes))
+    rays = np.empty(8 * QUAD * POINTS)
+    extremes = np.empty(2 * LANES, np.float32)
+    places = np.empty(QUAD, np.int64)
+    columns = np.empty((8 + 4 * n_modes) * QUAD)
+    cells = np.empty(BLOCK, np.int64)
+    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
+        end = min(n_cells, (block + 1) * BLOCK)
+        for begin in range(block * BLOCK, end, QUAD):
+            write_records(state, radius, begin, end, modes, record, places, columns)
+        for i in range(block * BLOCK, end):
+            mean = record[i, 2]
+            bend = record[i, 3]
+            if not mean > 0.0:
+                continue
+            high, low = sample(i, record, compass, modes, grid, pattern, extremes)
+            # Between two samples the radius exceeds them by at most spacing^2/8 |rho''|.
+            record[i, 3] = high + SLACK * mean + 0.125 * spacing * spacing * bend
+            record[i, 4] = low - SLACK * mean
+        if len(tension) > 0:
+            count = 0
+            for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
+                if record[i, 4] > 0.0:
+                    cells[count] = i
+                    count += 1
+            gradient_of_length(
+                cells, count, lane, sums, record, quarter, starts, modes, tangent, rays
+            )

@@ -9,11 +9,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from cellquant.sim.grazes import gap
 from cellquant.sim.lanes import QUAD, doubles, gather, load, store
 from cellquant.sim.outlines import BLOCK, HEAD
+from cellquant.sim.parts import shared
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 SLOTS = 32  # crossings of a cell whose powers are summed at once; a multiple of 4
@@ -159,32 +160,18 @@ def shape_forces(
     store(out, 0, area)
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def push_part(
-    state: Any,
-    radius: Any,
-    record: Any,
-    tangent: Any,
-    first: Any,
-    second: Any,
-    back_first: Any,
-    back_pair: Any,
-    back_cell: Any,
-    roots: Any,
-    root_first: Any,
-    root_last: Any,
-    sign: Any,
-    inside: Any,
-    numbers: Any,
-    modes: Any,
-    tension: Any,
-    torque: Any,
-    velocity: Any,
-    energy: Any,
-    part: int,
-    n_parts: int,
+@shared(FLAGS)
+def exact_velocity(
+    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
 ) -> None:
-    """One part of `exact_velocity`; here it is compiled once, inside a parallel loop twice."""
+    """Generalised velocity and energy of every cell from the crossings of its contour.
+
+    `numbers` holds v0, k, eta, mu_r, mu_theta, mu_ab.
+    """
+    (
+        state, radius, record, tangent, first, second, back_first, back_pair, back_cell, roots,
+        root_first, root_last, sign, inside, numbers, velocity, energy,
+    ) = arrays  # fmt: skip
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
     n_cells = state.shape[0]
@@ -305,59 +292,3 @@ def push_part(
                     velocity[i, 3 + m] = -scale * out[(1 + m) * QUAD + column]
                 bound = eta * tangent[i, 0] if len(tension) > 0 else 0.0
                 energy[i] = bound + k * (0.5 * out[column] + lens[column])
-
-
-@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
-def exact_velocity(
-    state: Any,
-    radius: Any,
-    record: Any,
-    tangent: Any,
-    first: Any,
-    second: Any,
-    back_first: Any,
-    back_pair: Any,
-    back_cell: Any,
-    roots: Any,
-    root_first: Any,
-    root_last: Any,
-    sign: Any,
-    inside: Any,
-    numbers: Any,
-    modes: Any,
-    tension: Any,
-    torque: Any,
-    velocity: Any,
-    energy: Any,
-    n_parts: int,
-) -> None:
-    """Generalised velocity and energy of every cell from the crossings of its contour.
-
-    `numbers` holds v0, k, eta, mu_r, mu_theta, mu_ab. For `n_parts` see `crossings`.
-    """
-    for part in prange(n_parts):
-        number: Any = np.int64(part)  # one type for all that is compiled
-        push_part(
-            state,
-            radius,
-            record,
-            tangent,
-            first,
-            second,
-            back_first,
-            back_pair,
-            back_cell,
-            roots,
-            root_first,
-            root_last,
-            sign,
-            inside,
-            numbers,
-            modes,
-            tension,
-            torque,
-            velocity,
-            energy,
-            number,
-            n_parts,
-        )

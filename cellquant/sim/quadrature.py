@@ -4,10 +4,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from cellquant.sim.lanes import LANES
 from cellquant.sim.outlines import BLOCK, HEAD
+from cellquant.sim.parts import shared
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 
@@ -44,31 +45,26 @@ def facing(
     return (middle if dy >= 0.0 else -middle) / spacing, 2.0 * angle / spacing
 
 
-@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
+@shared(FLAGS)
 def sample_contours(
-    state: Any,
-    radius: Any,
-    table: Any,
-    modes: Any,
-    record: Any,
-    rho: Any,
-    slope: Any,
+    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
 ) -> None:
     """Record every contour and its samples.
 
     `table` holds cos(n phi_s) in row 2(n - 1) and sin(n phi_s) in row 2(n - 1) + 1, n = 1 .. M.
     Writes `record` (see `outlines`), the samples `rho` and `slope` = d rho / d phi.
     """
+    state, radius, table, record, rho, slope = arrays
     n_cells = state.shape[0]
     size = table.shape[1]
     half = size // 2
     spacing = 2.0 * math.pi / size
     n_blocks = (n_cells + BLOCK - 1) // BLOCK
-    for block in prange(n_blocks):
-        even = np.zeros(half)
-        odd = np.zeros(half)
-        even_slope = np.zeros(half)
-        odd_slope = np.zeros(half)
+    even = np.zeros(half)
+    odd = np.zeros(half)
+    even_slope = np.zeros(half)
+    odd_slope = np.zeros(half)
+    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
         for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
             r0 = radius[i]
             power = 0.0
@@ -122,31 +118,19 @@ def sample_contours(
             record[i, 4] = low if power < 2.0 else math.nan
 
 
-@njit(cache=True, parallel=True, fastmath=FLAGS, error_model="numpy")
+@shared(FLAGS)
 def quadrature_velocity(
-    state: Any,
-    radius: Any,
-    record: Any,
-    rho: Any,
-    slope: Any,
-    table: Any,
-    first: Any,
-    other: Any,
-    shift: Any,
-    back_first: Any,
-    back_pair: Any,
-    back_cell: Any,
-    numbers: Any,
-    modes: Any,
-    tension: Any,
-    torque: Any,
-    velocity: Any,
+    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
 ) -> None:
     """Generalised velocity by the published rule: sums over the contour points inside a neighbour.
 
     The points stand at fixed directions phi_s = 2 pi s / K. Only how many neighbours hold a point
     matters, so the neighbours are counted first and every sum is taken once.
     """
+    (
+        state, radius, record, rho, slope, table, first, other, shift, back_first, back_pair,
+        back_cell, numbers, velocity,
+    ) = arrays  # fmt: skip
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
     n_cells = state.shape[0]
@@ -154,16 +138,16 @@ def quadrature_velocity(
     spacing = 2.0 * math.pi / size
     half = size // 2
     n_blocks = (n_cells + BLOCK - 1) // BLOCK
-    for block in prange(n_blocks):
-        held = np.empty(2 * size)
-        grid_x = np.empty(2 * size)
-        grid_y = np.empty(2 * size)
-        u = np.empty(size)
-        v = np.empty(size)
-        even = np.empty(half)
-        odd = np.empty(half)
-        even_slope = np.empty(half)
-        odd_slope = np.empty(half)
+    held = np.empty(2 * size)
+    grid_x = np.empty(2 * size)
+    grid_y = np.empty(2 * size)
+    u = np.empty(size)
+    v = np.empty(size)
+    even = np.empty(half)
+    odd = np.empty(half)
+    even_slope = np.empty(half)
+    odd_slope = np.empty(half)
+    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
         for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
             for s in range(size):
                 held[s] = 0.0
