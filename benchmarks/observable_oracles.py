@@ -31,9 +31,10 @@ from cellquant.observables.dynamics import (
     scattering_average,
 )
 from cellquant.observables.motion import displacements
+from cellquant.observables.pairs import pair_correlation
 from cellquant.observables.shape import describe
 from cellquant.observables.smoothing import from_tracks
-from cellquant.observables.structure import pair_correlation, structure_factor
+from cellquant.observables.structure import structure_factor
 from cellquant.tables import REDUCED, Tracks
 
 RESULTS = Path(__file__).parent / "results"

@@ -5,7 +5,8 @@ import pytest
 
 from cellquant.observables import observe
 from cellquant.observables.bonds import bond_order, neighbour_pairs
-from cellquant.observables.structure import pair_correlation, structure_factor
+from cellquant.observables.pairs import pair_correlation
+from cellquant.observables.structure import structure_factor
 from cellquant.tables import PHYSICAL, Cells
 from observables_examples import brownian, movie, tracks_of
 

@@ -13,7 +13,7 @@ from cellquant.observables.blocks import (
     ratio_with_error,
     sum_by_block,
 )
-from cellquant.observables.structure import Layer, blocks_of, layer_of, positions_by_frame
+from cellquant.observables.layer import Layer, blocks_of, layer_of, positions_by_frame
 from cellquant.observables.trajectories import FloatArray, IntArray
 from cellquant.rows import Scan
 from cellquant.tables import Cells, Tracks

@@ -194,7 +194,7 @@ class Context:
     @cached_property
     def layer(self) -> Any:
         """Positions in the frames on which structure is measured."""
-        from cellquant.observables.structure import layer_of
+        from cellquant.observables.layer import layer_of
 
         return layer_of(self.source, max_frames=self.settings.max_frames)
 

@@ -28,7 +28,7 @@ def structure_factor(context: Context, out: Results) -> None:
 
 
 def pair_correlation(context: Context, out: Results) -> None:
-    from cellquant.observables.structure import pair_correlation as measure
+    from cellquant.observables.pairs import pair_correlation as measure
 
     found = measure(context.layer, diameter=context.diameter["mean_diameter"])
     out.tables["pair_correlation"] = found.table

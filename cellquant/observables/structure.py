@@ -1,142 +1,18 @@
-"""Static structure of the layer: structure factor and pair correlation."""
+"""Static structure factor of the cell centres."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy import stats
-from scipy.spatial import cKDTree
 
-from cellquant.observables.blocks import (
-    Blocks,
-    jackknife_error,
-    leave_one_out,
-    ratio_with_error,
-)
-from cellquant.observables.shape import cell_blocks
+from cellquant.observables.blocks import jackknife_error, leave_one_out
+from cellquant.observables.layer import Layer, layer_of, positions_by_frame
 from cellquant.observables.trajectories import FloatArray, IntArray
-from cellquant.rows import Scan, rows_of
-from cellquant.tables import TRACK_COLUMNS, Cells, Tracks
+from cellquant.rows import Scan
+from cellquant.tables import Cells, Tracks
 
 _GROUPS = 8  # interleaved groups of wave vectors, for the error of the peak
-
-
-@dataclass(frozen=True)
-class Layer:
-    """Positions of some frames, and the rectangle they live in.
-
-    Attributes
-    ----------
-    rows
-        Rows of the source in the chosen frames with a finite position.
-    frames
-        The chosen frame numbers.
-    corner, edges
-        Lower corner and edges of the rectangle: the periodic box, or the extent of all positions.
-    periodic
-        Whether the rectangle is a periodic box.
-    filled
-        Share of the rectangle that cells can occupy, at most 1.
-    """
-
-    rows: pd.DataFrame
-    frames: IntArray
-    corner: FloatArray
-    edges: FloatArray
-    periodic: bool
-    filled: float = 1.0
-
-    @property
-    def note(self) -> dict[str, Any]:
-        """Summary entries on a rectangle that cells fill in part only; nothing where they do."""
-        if self.filled > 0.9:
-            return {}
-        note = (
-            f"cells can occupy {self.filled:.0%} of the rectangle around them: the contrast with "
-            "the empty part raises g(r) at every distance, its peak by up to the inverse of this "
-            "share, and S(q) at small q"
-        )
-        return {"filled": self.filled, "note": note}
-
-
-def layer_of(source: Tracks | Cells | Scan | Layer, *, max_frames: int = 32) -> Layer:
-    """Choose at most max_frames frames, evenly spaced, and the rectangle around the cells.
-
-    Of a table on disk only these frames are held. A layer is returned as it is.
-    """
-    if isinstance(source, Layer):
-        return source
-    head = source.head if isinstance(source, Scan) else source
-    rows = rows_of(source)
-    present = np.empty(0, dtype=np.int64)
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for piece in rows.pieces("frame", "x", "y"):
-        x, y = piece["x"], piece["y"]
-        known = np.isfinite(x) & np.isfinite(y)
-        present = np.union1d(present, piece["frame"][known])
-        if known.any():
-            low = np.minimum(low, (x[known].min(), y[known].min()))
-            high = np.maximum(high, (x[known].max(), y[known].max()))
-    if present.size > max_frames:
-        chosen = np.round(np.linspace(0, present.size - 1, max_frames)).astype(np.int64)
-        present = present[chosen]
-    box = head.box if isinstance(head, Tracks) else None
-    corner, edges = np.zeros(2), np.zeros(2)
-    if box is not None:
-        edges = np.array(box, dtype=np.float64)
-    elif present.size:
-        corner, edges = low, high - low
-    names = ("frame", "x", "y", "touches_border", *(("track_id",) if rows.linked else ()))
-    parts = []
-    for piece in rows.pieces(*names):
-        used = np.isin(piece["frame"], present)
-        used &= np.isfinite(piece["x"]) & np.isfinite(piece["y"])
-        parts.append(pd.DataFrame({name: piece[name][used] for name in names}))
-    empty = pd.DataFrame({name: np.empty(0, TRACK_COLUMNS[name]) for name in names})
-    table = pd.concat(parts, ignore_index=True) if parts else empty
-    table = table.sort_values("frame", kind="stable").reset_index(drop=True)
-    filled = 1.0
-    if box is None and (edges > 0).all():
-        area = head.area if isinstance(head, Tracks) else float(np.mean(head.occupied_area))
-        filled = min(1.0, area / float(np.prod(edges)))
-    return Layer(table, present, corner, edges, box is not None, filled)
-
-
-def blocks_of(layer: Layer, used: Any = slice(None)) -> Blocks:
-    """Replicate blocks of the rows of a layer, or of some of them."""
-    rows = layer.rows[used]
-    track = rows["track_id"].to_numpy() if "track_id" in rows.columns else None
-    box = (float(layer.edges[0]), float(layer.edges[1])) if layer.periodic else None
-    return cell_blocks(rows[["x", "y"]].to_numpy(dtype=np.float64), track, box)
-
-
-def positions_by_frame(layer: Layer) -> list[tuple[IntArray, FloatArray]]:
-    """Row numbers and positions of each frame, inside the rectangle."""
-    frame = layer.rows["frame"].to_numpy(dtype=np.int64)
-    place = layer.rows[["x", "y"]].to_numpy(dtype=np.float64) - layer.corner
-    if layer.periodic:
-        place = np.mod(place, layer.edges)
-        place = np.where(place >= layer.edges, 0.0, place)
-    cuts = np.searchsorted(frame, layer.frames)
-    groups = np.split(np.arange(frame.size), cuts[1:]) if frame.size else []
-    return [(rows, place[rows]) for rows in groups]
-
-
-@dataclass(frozen=True)
-class PairCorrelation:
-    """g(r) and its highest peak.
-
-    Attributes
-    ----------
-    table
-        distance, value, std_error, n_pairs.
-    peak
-        peak_distance, peak_height and their errors; None with a reason where there is no peak.
-    """
-
-    table: pd.DataFrame
-    peak: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -146,7 +22,7 @@ class StructureFactor:
     Attributes
     ----------
     table
-        wave_number, value, std_error, n_vectors.
+        wave_number, value, std_error, n_vectors, n_independent.
     peak
         q_peak, its std_error and height; None with a reason where there is no peak.
     """
@@ -185,10 +61,13 @@ def structure_factor(
     StructureFactor
         The first peak is the highest shell between 0.6 and 1.6 times ``2 pi sqrt(density)``, the
         wave number of the spacing of the cells, refined by a parabola.
-        Errors: spread of the time-averaged values over the vectors of a shell, of the peak:
-        jackknife over eight interleaved groups of vectors. Undefined with fewer than two cells
-        or no extent in x or y. Bias: in an open field that cells fill unevenly, the smallest q
-        measure the envelope of the layer.
+        Errors: spread of the time-averaged values over the vectors of a shell about a straight
+        line in q, of the peak: jackknife over eight interleaved groups of vectors. Both grow by
+        the root of n_vectors/n_independent, found from how far the vectors of a shell rise and
+        fall together from frame to frame: in a crystal q and G - q measure the same waves. Use t
+        with n_vectors - 2 degrees of freedom. Undefined with fewer than two cells or no extent in
+        x or y. Bias: in an open field that cells fill unevenly, the smallest q measure the
+        envelope of the layer; of a single frame n_independent is taken as n_vectors.
 
     References
     ----------
@@ -197,7 +76,7 @@ def structure_factor(
     layer = layer_of(source, max_frames=max_frames)
     frames = [place for _, place in positions_by_frame(layer) if len(place) >= 2]
     empty = pd.DataFrame({name: np.empty(0) for name in ("wave_number", "value", "std_error")})
-    empty["n_vectors"] = np.empty(0, dtype=np.int64)
+    empty = empty.assign(n_vectors=np.empty(0, dtype=np.int64), n_independent=np.empty(0))
     none = {"q_peak": None, "q_peak_std_error": None}
     if not frames or not (layer.edges > 0).all():
         reason = "fewer than two cells in every frame, or all on a line"
@@ -212,41 +91,106 @@ def structure_factor(
     limit = min(limit, float(np.sqrt(5e5 * np.prod(step))))
     n_x, n_y = np.maximum(np.ceil(np.minimum(limit / step, 1e6)).astype(int), 1)
     q_x, q_y = np.arange(n_x + 1) * step[0], np.arange(-n_y, n_y + 1) * step[1]
-    power = np.zeros((q_x.size, q_y.size))
-    for place in frames:
-        wave_x = np.exp(-1j * np.outer(q_x, place[:, 0]))
-        wave_y = np.exp(-1j * np.outer(place[:, 1], q_y))
-        power += np.abs(wave_x @ wave_y) ** 2 / len(place)
-    power /= len(frames)
     q = np.hypot(*np.meshgrid(q_x, q_y, indexing="ij"))
     # One of each pair q, -q; on the line q_x = 0 that is q_y > 0.
     half = (q > 0) & (q <= limit) & ~((q_x[:, None] == 0) & (q_y[None, :] < 0))
-    return _shells(q[half], power[half], float(step.max()), scale)
+    shells = _Shells.of(q[half], float(step.max()))
+    for place in frames:
+        wave_x = np.exp(-1j * np.outer(q_x, place[:, 0]))
+        wave_y = np.exp(-1j * np.outer(place[:, 1], q_y))
+        shells.add((np.abs(wave_x @ wave_y) ** 2 / len(place))[half])
+    return _summarise(shells, scale)
 
 
-def _shells(q: FloatArray, power: FloatArray, width: float, scale: float) -> StructureFactor:
-    shell = np.floor(q / width - 0.5).astype(np.int64)
-    n_shells = int(shell.max()) + 1
-    # Vectors below half a width, if the rectangle is elongated, join the first shell.
-    shell = np.maximum(shell, 0)
-    group = np.arange(q.size) % _GROUPS
-    counts = np.zeros((_GROUPS, n_shells))
-    sums, wave = np.zeros_like(counts), np.zeros_like(counts)
-    np.add.at(counts, (group, shell), 1.0)
-    np.add.at(sums, (group, shell), power)
-    np.add.at(wave, (group, shell), q)
-    n = counts.sum(axis=0)
-    filled = n > 0
-    n, counts, sums, wave = n[filled], counts[:, filled], sums[:, filled], wave[:, filled]
-    mean_q, value = wave.sum(axis=0) / n, sums.sum(axis=0) / n
-    renumber = np.cumsum(filled) - 1
-    squares = np.bincount(renumber[shell], weights=(power - value[renumber[shell]]) ** 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.where(n >= 2, np.sqrt(squares / (n - 1) / n), np.nan)
+@dataclass
+class _Shells:
+    """Wave vectors in shells, and the powers of the frames so far.
+
+    q, index and n: wave numbers, their shells, vectors per shell. total and squares: sums over
+    frames, per vector and (of the squared powers) per shell. means: of each shell, per frame.
+    """
+
+    q: FloatArray
+    index: IntArray
+    n: FloatArray
+    total: FloatArray
+    squares: FloatArray
+    means: list[FloatArray]
+
+    @classmethod
+    def of(cls, q: FloatArray, width: float) -> "_Shells":
+        # Vectors below half a width, if the rectangle is elongated, join the first shell.
+        shell = np.maximum(np.floor(q / width - 0.5).astype(np.int64), 0)
+        _, index, n = np.unique(shell, return_inverse=True, return_counts=True)
+        return cls(q, index, n.astype(np.float64), np.zeros(q.size), np.zeros(n.size), [])
+
+    def sum(self, values: FloatArray) -> FloatArray:
+        """Sum over the vectors of each shell."""
+        return np.asarray(np.bincount(self.index, weights=values), dtype=np.float64)
+
+    def add(self, power: FloatArray) -> None:
+        """Take in the powers of the next frame."""
+        self.total += power
+        self.squares += self.sum(power**2)
+        self.means.append(self.sum(power) / self.n)
+
+    def standard_error(self) -> FloatArray:
+        """Spread of the time averages over the vectors, about a straight line in q.
+
+        Each shell has a line of its own: how S(q) changes within the shell is no error.
+        """
+        power = self.total / len(self.means)
+        away = self.q - (self.sum(self.q) / self.n)[self.index]
+        rest = power - (self.sum(power) / self.n)[self.index]
+        width = self.sum(away**2)
+        sloped = width > 1e-18 * self.sum(self.q**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = np.where(sloped, self.sum(away * rest) / width, 0.0)
+            free = self.n - 1 - sloped
+            squares = self.sum((rest - slope[self.index] * away) ** 2)
+            return np.where(free >= 1, np.sqrt(squares / np.maximum(free, 1) / self.n), np.nan)
+
+    def coupling(self) -> FloatArray:
+        """Vectors that count as one, at least 1: how much the vectors of a shell vary together.
+
+        The mean square of the frames over that of the rest, in the table of vectors and frames
+        of a shell: 1 when the vectors vary independently, 1 + (n - 1) c when each two of the n
+        have the correlation c.
+        """
+        frames, n = len(self.means), self.n
+        mean = self.sum(self.total) / frames / n
+        of_vectors = frames * self.sum((self.total / frames - mean[self.index]) ** 2)
+        of_frames = n * np.sum((np.array(self.means) - mean) ** 2, axis=0)
+        rest = self.squares - n * frames * mean**2 - of_vectors - of_frames
+        known = (n > 1) & (rest > 1e-9 * self.squares) & (frames > 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(known, np.maximum((n - 1) * of_frames / rest, 1.0), 1.0)
+
+
+def _summarise(shells: _Shells, scale: float) -> StructureFactor:
+    n, coupling = shells.n, shells.coupling()
+    power = shells.total / len(shells.means)
+    value, mean_q = shells.sum(power) / n, shells.sum(shells.q) / n
+    error = shells.standard_error() * np.sqrt(coupling)
     table = pd.DataFrame(
-        {"wave_number": mean_q, "value": value, "std_error": error, "n_vectors": n.astype(np.int64)}
+        {
+            "wave_number": mean_q,
+            "value": value,
+            "std_error": error,
+            "n_vectors": n.astype(np.int64),
+            "n_independent": n / coupling,
+        }
     )
-    return StructureFactor(table, _first_peak(mean_q, value, error, sums, counts, scale))
+    sums, counts = np.zeros((_GROUPS, n.size)), np.zeros((_GROUPS, n.size))
+    group = np.arange(power.size) % _GROUPS
+    np.add.at(counts, (group, shells.index), 1.0)
+    np.add.at(sums, (group, shells.index), power)
+    peak = _first_peak(mean_q, value, error, sums, counts, scale)
+    if peak.get("q_peak_std_error") is not None:
+        widen = float(np.sqrt(np.interp(peak["q_peak"], mean_q, coupling)))
+        peak["q_peak_std_error"] *= widen
+        peak["height_std_error"] *= widen
+    return StructureFactor(table, peak)
 
 
 def _first_peak(
@@ -296,143 +240,3 @@ def _first_peak(
         "height_std_error": spread[1],
         "std_error_method": f"jackknife over {_GROUPS} interleaved groups of wave vectors",
     }
-
-
-def pair_correlation(
-    source: Tracks | Cells | Scan | Layer,
-    *,
-    diameter: float | None = None,
-    max_distance: float | None = None,
-    bin_width: float | None = None,
-    max_frames: int = 32,
-) -> PairCorrelation:
-    """Pair correlation function.
-
-    ``g(r) = pairs in the ring / pairs expected of independent points``. In a periodic box the
-    expectation is ``N (N - 1)/2 x ring area / box area``; in an open rectangle a x b it carries
-    the exact fraction of the ring that lies inside, averaged over places and directions,
-    ``1 - 2 r (a + b)/(pi a b) + r^2/(pi a b)``.
-
-    Parameters
-    ----------
-    source
-        Tracks, cells, or a layer.
-    diameter
-        Mean cell diameter, for the defaults; from the density when None.
-    max_distance
-        Largest r; five diameters, at most half of the shorter edge.
-    bin_width
-        Width of the rings; a twentieth of a diameter when None.
-    max_frames
-        Frames used, evenly spaced.
-
-    Returns
-    -------
-    PairCorrelation
-        Errors: jackknife over blocks of cells; in an open field these include the difference
-        between border and centre and are too large at long range. The peak is the highest
-        place, refined by a parabola whose weights fall off over two rings around its own vertex,
-        which lowers a narrow peak. Empty with fewer than two cells; no peak where no five rings
-        together exceed 1 at a level of 1 % for all places.
-    """
-    layer = layer_of(source, max_frames=max_frames)
-    names = ("distance", "value", "std_error")
-    frames = [(rows, place) for rows, place in positions_by_frame(layer) if len(rows) >= 2]
-    if not frames or not (layer.edges > 0).all():
-        table = pd.DataFrame({**{k: np.empty(0) for k in names}, "n_pairs": np.empty(0, np.int64)})
-        reason = "fewer than two cells in every frame, or all on a line"
-        return PairCorrelation(table, {**_NO_PEAK, "reason": reason})
-    area = float(np.prod(layer.edges))
-    d = diameter or float(np.sqrt(area / np.mean([len(r) for r, _ in frames])))
-    reach = min(max_distance or 5 * d, 0.5 * float(layer.edges.min()))
-    n_bins = max(int(np.floor(reach / (bin_width or d / 20))), 1)
-    edges = np.linspace(0, reach, n_bins + 1)
-    a, b = layer.edges
-    covered = 0.5 * edges**2 * 2 * np.pi * area
-    if not layer.periodic:
-        covered = 2 * np.pi * (area * edges**2 / 2 - 2 * (a + b) * edges**3 / (3 * np.pi))
-        covered += edges**4 / 2
-    share = np.diff(covered) / area**2
-    blocks = blocks_of(layer)
-    found = np.zeros((blocks.n, n_bins))
-    expected = np.zeros(blocks.n)
-    for rows, place in frames:
-        tree = cKDTree(place, boxsize=layer.edges if layer.periodic else None)
-        pairs = tree.query_pairs(reach, output_type="ndarray")
-        gap = _gap(place[pairs[:, 0]], place[pairs[:, 1]], layer)
-        ring = np.minimum(np.searchsorted(edges, gap, side="right") - 1, n_bins - 1)
-        for side in (0, 1):
-            np.add.at(found, (blocks.index[rows[pairs[:, side]]], ring), 0.5)
-        np.add.at(expected, blocks.index[rows], 0.5 * (len(rows) - 1))
-    expected_pairs = expected[:, None] * share[None]
-    value, error = ratio_with_error(found, expected_pairs)
-    distance = 0.5 * (edges[1:] + edges[:-1])
-    table = pd.DataFrame(
-        {
-            "distance": distance,
-            "value": value,
-            "std_error": error,
-            "n_pairs": np.rint(found.sum(axis=0)).astype(np.int64),
-        }
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rest = leave_one_out(found) / leave_one_out(expected_pairs)
-    peak = _highest(distance, value, rest, expected_pairs.sum(axis=0))
-    return PairCorrelation(table, {**peak, "std_error_method": blocks.method})
-
-
-_NO_PEAK: dict[str, Any] = {
-    "peak_distance": None, "peak_distance_std_error": None,
-    "peak_height": None, "peak_height_std_error": None,
-}  # fmt: skip
-
-
-def _highest(
-    r: FloatArray, value: FloatArray, rest: FloatArray, n_expected: FloatArray
-) -> dict[str, Any]:
-    """Highest place that stands out from 1, with errors from the curves without each block."""
-    if r.size < 8:
-        return {**_NO_PEAK, "reason": "fewer than eight rings fit into the field"}
-    # Five rings together are looked at, for more pairs. None of independent points should pass in
-    # 99 of 100 layers, whatever their number; few pairs have at least the error of their count.
-    five = np.ones(5)
-    smooth = np.convolve(value, five / 5, "valid")
-    spread = jackknife_error(np.array([np.convolve(curve, five / 5, "valid") for curve in rest]))
-    spread = np.maximum(spread, np.sqrt(1 / np.convolve(n_expected, five, "valid")))
-    reach = stats.t.ppf(1 - 0.01 / smooth.size, max(len(rest) - 1, 1))
-    stands_out = smooth - 1 > reach * np.where(np.isfinite(spread), spread, np.inf)
-    if not stands_out.any():
-        reason = "g(r) nowhere stands out from that of independent positions"
-        return {**_NO_PEAK, "reason": reason}
-    k = int(np.argmax(np.where(stands_out, smooth, -np.inf))) + 2
-    width = 2 * (r[1] - r[0])
-
-    def place(curve: FloatArray) -> tuple[float, float]:
-        """Vertex of the parabola fitted around itself, with weights that fall off smoothly."""
-        at, level = float(r[k]), float(curve[k])
-        for _ in range(10):
-            weight = np.exp(-0.25 * ((r - at) / width) ** 2)
-            used = np.isfinite(curve) & (weight > 1e-3)
-            bend, slope, level = np.polyfit(r[used] - at, curve[used], 2, w=weight[used])
-            shift = -slope / (2 * bend) if bend < 0 else np.inf
-            if not abs(shift) < width:
-                return float(r[k]), float(curve[k])
-            at, level = at + shift, level + slope * shift / 2
-        return at, level
-
-    distance, height = place(value)
-    errors = jackknife_error(np.array([place(curve) for curve in rest]))
-    return {
-        "peak_distance": distance,
-        "peak_distance_std_error": float(errors[0]),
-        "peak_height": height,
-        "peak_height_std_error": float(errors[1]),
-    }
-
-
-def _gap(first: FloatArray, second: FloatArray, layer: Layer) -> FloatArray:
-    delta = first - second
-    if layer.periodic:
-        delta -= layer.edges * np.round(delta / layer.edges)
-    gap: FloatArray = np.hypot(delta[:, 0], delta[:, 1])
-    return gap
