@@ -156,14 +156,34 @@ def test_censored_values_are_compared_by_the_log_rank_test() -> None:
     rng = np.random.default_rng(3)
     rows = [
         {"condition": c, "trial": k, "quantity": "tau_alpha", "value": v, "censored": v >= 3}
-        for c, m in (("a", 1.0), ("b", 4.0))
+        for c, m in (("a", 1.0), ("b", 4.0), ("c", 0.2), ("d", 0.2))
         for k, v in enumerate(np.minimum(rng.exponential(m, 12), 3.0))
     ]
-    (row,) = compare_conditions(pd.DataFrame(rows))
+    for row in rows[36:]:
+        row["value"] = min(row["value"], 2.9)
+    found = {(r["first"], r["second"]): r for r in compare_conditions(pd.DataFrame(rows))}
+    row = found["a", "b"]
     assert row["test"] == "log-rank"
     assert row["n_censored"] > 0
     assert row["rank_biserial"] is None
     assert 0 < row["p_value"] < 0.1
+    assert "bounds" in row["reason"]
+    # One family of six pairs, one of them without a bound.
+    assert found["c", "d"]["test"] == "Mann-Whitney"
+    p_values = np.array([r["p_value"] for r in found.values()])
+    np.testing.assert_allclose([r["p_holm"] for r in found.values()], holm(p_values))
+    assert min(r["p_holm"] for r in found.values()) == pytest.approx(6 * p_values.min())
+
+
+def test_conditions_that_are_all_bounds_say_so() -> None:
+    rows = [
+        {"condition": c, "trial": k, "quantity": "tau_alpha", "value": 3.0, "censored": True}
+        for c in "ab"
+        for k in range(3)
+    ]
+    (row,) = study_statistics(study(2), pd.DataFrame(rows))["mann_whitney"]
+    assert row["p_value"] is row["p_holm"] is None
+    assert "fewer than two values are known" in row["reason"]
 
 
 def test_a_study_is_json_ready_and_says_its_rules() -> None:

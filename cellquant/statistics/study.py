@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from cellquant.statistics.censored import fit_censored_model
-from cellquant.statistics.comparisons import log_rank, mann_whitney, mean_over_trials
+from cellquant.statistics.comparisons import holm, log_rank, mann_whitney, mean_over_trials
 from cellquant.statistics.mixed import fit_mixed_model
 
 CENSORING_RULE = (
@@ -138,9 +138,9 @@ def compare_conditions(trial_values: pd.DataFrame) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        The columns of `mann_whitney` with quantity; Holm's correction over the pairs of one
-        quantity. Where values are censored the ranks are not known: P is then that of the
-        log-rank test, ``test`` says so and n_censored counts them.
+        The columns of `mann_whitney` with quantity. Where values are censored the ranks are not
+        known: P is then that of the log-rank test, ``test`` says so and n_censored counts them.
+        Holm's correction is over the pairs of one quantity, whichever test they took.
     """
     found: list[dict[str, Any]] = []
     for quantity, rows in trial_values.groupby("quantity", sort=False):
@@ -151,25 +151,38 @@ def compare_conditions(trial_values: pd.DataFrame) -> list[dict[str, Any]]:
         value = rows["value"].to_numpy(dtype=np.float64)
         groups = {name: value[names == name] for name in dict.fromkeys(names)}
         bounds = {name: censored[names == name] for name in groups}
-        table = mann_whitney(groups)
-        for record in table.to_dict("records"):
+        tests: list[dict[str, Any]] = []
+        for record in mann_whitney(groups).to_dict("records"):
             row: dict[str, Any] = {str(key): item for key, item in record.items()}
             pair = row["first"], row["second"]
             n_censored = int(sum(bounds[name].sum() for name in pair))
             row.update(quantity=quantity, test="Mann-Whitney", n_censored=n_censored)
             if n_censored:
-                keep = [np.isfinite(groups[name]) for name in pair]
-                row["p_value"] = log_rank(
-                    *(groups[name][k] for name, k in zip(pair, keep, strict=True)),
-                    first_censored=bounds[pair[0]][keep[0]],
-                    second_censored=bounds[pair[1]][keep[1]],
-                )
-                row.update(
-                    test="log-rank", u=None, superiority=None, rank_biserial=None, p_holm=None,
-                    smallest_p=None,
-                )  # fmt: skip
-            found.append(row)
+                row.update(_log_rank_test([groups[k] for k in pair], [bounds[k] for k in pair]))
+            tests.append(row)
+        # Holm's rule holds for any tests, so the pairs of a quantity are one family.
+        adjusted = holm(np.array([row["p_value"] for row in tests], dtype=np.float64))
+        for row, p_holm in zip(tests, adjusted.tolist(), strict=True):
+            row["p_holm"] = p_holm
+        found += tests
     return found
+
+
+def _log_rank_test(values: list[Any], bounds: list[Any]) -> dict[str, Any]:
+    """What the log-rank test of two conditions puts in the place of Mann-Whitney's."""
+    keep = [np.isfinite(v) for v in values]
+    p_value = log_rank(
+        *(v[k] for v, k in zip(values, keep, strict=True)),
+        first_censored=bounds[0][keep[0]],
+        second_censored=bounds[1][keep[1]],
+    )
+    reason = "ranks are not known where values are bounds"
+    if not np.isfinite(p_value):
+        reason = "fewer than two values are known, the others are bounds"
+    return {
+        "test": "log-rank", "p_value": p_value, "u": None, "superiority": None,
+        "rank_biserial": None, "smallest_p": None, "reason": reason,
+    }  # fmt: skip
 
 
 def study_statistics(
