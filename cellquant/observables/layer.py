@@ -1,12 +1,14 @@
 """Positions of a few frames of a layer, and the region that its cells can occupy."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from cellquant.observables.blocks import Blocks
+from cellquant.observables.region import REGION_RULE, Region, find_region
 from cellquant.observables.shape import cell_blocks
 from cellquant.observables.trajectories import FloatArray, IntArray
 from cellquant.rows import Scan, rows_of
@@ -27,8 +29,6 @@ class Layer:
         Lower corner and edges of the rectangle: the periodic box, or the extent of all positions.
     periodic
         Whether the rectangle is a periodic box.
-    filled
-        Share of the rectangle that cells can occupy, at most 1.
     """
 
     rows: pd.DataFrame
@@ -36,7 +36,19 @@ class Layer:
     corner: FloatArray
     edges: FloatArray
     periodic: bool
-    filled: float = 1.0
+
+    @cached_property
+    def regions(self) -> list[Region | None]:
+        """Of each frame the part of the rectangle that cells can occupy; None where it is all."""
+        if self.periodic or not (self.edges > 0).all():
+            return [None] * self.frames.size
+        return [find_region(place, self.edges) for _, place in positions_by_frame(self)]
+
+    @property
+    def filled(self) -> float:
+        """Share of the rectangle that cells can occupy, mean over the frames."""
+        shares = [1.0 if region is None else region.share for region in self.regions]
+        return float(np.mean(shares)) if shares else 1.0
 
     @property
     def note(self) -> dict[str, Any]:
@@ -44,9 +56,8 @@ class Layer:
         if self.filled > 0.9:
             return {}
         note = (
-            f"cells can occupy {self.filled:.0%} of the rectangle around them: the contrast with "
-            "the empty part raises g(r) at every distance, its peak by up to the inverse of this "
-            "share, and S(q) at small q"
+            f"cells can occupy {self.filled:.0%} of the rectangle around them ({REGION_RULE}): "
+            "g(r) is normalised by that part, S(q) at small q shows its outline"
         )
         return {"filled": self.filled, "note": note}
 
@@ -87,11 +98,7 @@ def layer_of(source: Tracks | Cells | Scan | Layer, *, max_frames: int = 32) -> 
     empty = pd.DataFrame({name: np.empty(0, TRACK_COLUMNS[name]) for name in names})
     table = pd.concat(parts, ignore_index=True) if parts else empty
     table = table.sort_values("frame", kind="stable").reset_index(drop=True)
-    filled = 1.0
-    if box is None and (edges > 0).all():
-        area = head.area if isinstance(head, Tracks) else float(np.mean(head.occupied_area))
-        filled = min(1.0, area / float(np.prod(edges)))
-    return Layer(table, present, corner, edges, box is not None, filled)
+    return Layer(table, present, corner, edges, box is not None)
 
 
 def blocks_of(layer: Layer, used: Any = slice(None)) -> Blocks:

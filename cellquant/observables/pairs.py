@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from cellquant.observables.blocks import jackknife_error, leave_one_out, ratio_with_error
 from cellquant.observables.layer import Layer, blocks_of, layer_of, positions_by_frame
+from cellquant.observables.region import Region
 from cellquant.observables.trajectories import FloatArray
 from cellquant.rows import Scan
 from cellquant.tables import Cells, Tracks
@@ -44,7 +45,9 @@ def pair_correlation(
     ``g(r) = pairs in the ring / pairs expected of independent points``. In a periodic box the
     expectation is ``N (N - 1)/2 x ring area / box area``; in an open rectangle a x b it carries
     the exact fraction of the ring that lies inside, averaged over places and directions,
-    ``1 - 2 r (a + b)/(pi a b) + r^2/(pi a b)``.
+    ``1 - 2 r (a + b)/(pi a b) + r^2/(pi a b)``. Where cells fill the rectangle in part only
+    (`find_region`), the area W that they can occupy takes its place: ``N (N - 1)/2 x ring area x
+    gamma(r)/W^2`` with gamma(r) the area that W shares with itself moved by r.
 
     Parameters
     ----------
@@ -67,37 +70,38 @@ def pair_correlation(
         place, refined by a parabola whose weights fall off over two rings around its own vertex,
         which lowers a narrow peak. Empty with fewer than two cells; no peak where no five rings
         together exceed 1 at a level of 1 % for all places.
+
+    References
+    ----------
+    Ohser & Stoyan, Biom. J. 23, 523 (1981), doi:10.1002/bimj.4710230602.
     """
     layer = layer_of(source, max_frames=max_frames)
     names = ("distance", "value", "std_error")
-    frames = [(rows, place) for rows, place in positions_by_frame(layer) if len(rows) >= 2]
+    frames = [
+        (rows, place, region)
+        for (rows, place), region in zip(positions_by_frame(layer), layer.regions, strict=True)
+        if len(rows) >= 2
+    ]
     if not frames or not (layer.edges > 0).all():
         table = pd.DataFrame({**{k: np.empty(0) for k in names}, "n_pairs": np.empty(0, np.int64)})
         reason = "fewer than two cells in every frame, or all on a line"
         return PairCorrelation(table, {**_NO_PEAK, "reason": reason})
-    area = float(np.prod(layer.edges))
-    d = diameter or float(np.sqrt(area / np.mean([len(r) for r, _ in frames])))
+    area = float(np.prod(layer.edges)) * layer.filled
+    d = diameter or float(np.sqrt(area / np.mean([len(r) for r, _, _ in frames])))
     reach = min(max_distance or 5 * d, 0.5 * float(layer.edges.min()))
     n_bins = max(int(np.floor(reach / (bin_width or d / 20))), 1)
     edges = np.linspace(0, reach, n_bins + 1)
-    a, b = layer.edges
-    covered = 0.5 * edges**2 * 2 * np.pi * area
-    if not layer.periodic:
-        covered = 2 * np.pi * (area * edges**2 / 2 - 2 * (a + b) * edges**3 / (3 * np.pi))
-        covered += edges**4 / 2
-    share = np.diff(covered) / area**2
     blocks = blocks_of(layer)
-    found = np.zeros((blocks.n, n_bins))
-    expected = np.zeros(blocks.n)
-    for rows, place in frames:
+    found, expected_pairs = np.zeros((blocks.n, n_bins)), np.zeros((blocks.n, n_bins))
+    for rows, place, region in frames:
         tree = cKDTree(place, boxsize=layer.edges if layer.periodic else None)
         pairs = tree.query_pairs(reach, output_type="ndarray")
         gap = _gap(place[pairs[:, 0]], place[pairs[:, 1]], layer)
         ring = np.minimum(np.searchsorted(edges, gap, side="right") - 1, n_bins - 1)
         for side in (0, 1):
             np.add.at(found, (blocks.index[rows[pairs[:, side]]], ring), 0.5)
-        np.add.at(expected, blocks.index[rows], 0.5 * (len(rows) - 1))
-    expected_pairs = expected[:, None] * share[None]
+        members = np.bincount(blocks.index[rows], minlength=blocks.n)
+        expected_pairs += np.outer(0.5 * (len(rows) - 1) * members, _share(layer, region, edges))
     value, error = ratio_with_error(found, expected_pairs)
     distance = 0.5 * (edges[1:] + edges[:-1])
     table = pd.DataFrame(
@@ -112,6 +116,20 @@ def pair_correlation(
         rest = leave_one_out(found) / leave_one_out(expected_pairs)
     peak = _highest(distance, value, rest, expected_pairs.sum(axis=0))
     return PairCorrelation(table, {**peak, "std_error_method": blocks.method})
+
+
+def _share(layer: Layer, region: Region | None, edges: FloatArray) -> FloatArray:
+    """Probability that two independent points of the layer lie each ring apart."""
+    if region is not None:
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        rings = np.pi * np.diff(edges**2)
+        return np.asarray(rings * region.overlap(middle) / region.area**2)
+    a, b = layer.edges
+    area = float(a * b)
+    covered = np.pi * area * edges**2
+    if not layer.periodic:
+        covered = covered - 4 * (a + b) * edges**3 / 3 + edges**4 / 2
+    return np.asarray(np.diff(covered) / area**2)
 
 
 _NO_PEAK: dict[str, Any] = {
