@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cellquant.track.fates import Fates
 from cellquant.track.kernels import neighbour_mean, pair_gains
@@ -121,16 +120,6 @@ def paths(movie: Movie, links: Links | None, flow: FloatArray, carried: FloatArr
             own_before, arrived, movie.neighbours, NEAR, carried - before_drift, 0.5, around_before
         )
     return Paths(drift, own_after, own_before, has_after, has_before, around_after, around_before)
-
-
-def carried_flow(movie: Movie, flow: FloatArray) -> FloatArray:
-    """Flow per frame of the frame before, (N, 2), at the cells that it brings nearest."""
-    carried = np.zeros((movie.n_cells, 2))
-    for index in range(len(movie.time) - 1):
-        a, b = movie.cells_of(index), movie.cells_of(index + 1)
-        _, nearest = cKDTree(movie.position[a] + flow[a]).query(movie.position[b])
-        carried[b] = flow[a][nearest] / (movie.time[index + 1] - movie.time[index])
-    return carried
 
 
 def regressors(paths: Paths, source: IntArray, target: IntArray) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cellquant.track.kernels import division_gains
-from cellquant.track.movie import LOG_AREA, FloatArray, IntArray, Links, Movie
+from cellquant.track.movie import LOG_AREA, BoolArray, FloatArray, IntArray, Links, Movie
 
 _PRIOR_DIVISIONS = 10.0
 _PER_MOTHER = 3
@@ -150,9 +150,8 @@ def _log_normal(values: FloatArray, mean: float, deviation: float) -> FloatArray
 
 def propose(
     movie: Movie,
-    index: int,
     candidates: IntArray,
-    orphan: IntArray,
+    orphan: BoolArray,
     middle: FloatArray,
     model: Divisions,
     spread: FloatArray,
@@ -161,16 +160,14 @@ def propose(
     leave: FloatArray,
     appear: FloatArray,
 ) -> tuple[IntArray, FloatArray]:
-    """Divisions between frame `index` and the next that are likelier than three single cells.
+    """Divisions that are likelier than three single cells, or nearly so.
 
-    Returns (mother, daughter, daughter) as indices into all cells, at most three per mother, and
-    their log odds.
+    Returns (mother, daughter, daughter) as indices into all cells, at most three per mother, best
+    first, and their log odds.
     """
-    first, last = int(movie.start[index]), int(movie.start[index + 1])
-    limit = 20 * (last - first) + 64
     least = -_LEAST  # an image cue can still speak for it
-    cells = np.empty((limit, 3), dtype=np.int64)
-    gain = np.empty(limit)
+    cells = np.empty((_PER_MOTHER * movie.n_cells, 3), dtype=np.int64)
+    gain = np.empty(len(cells))
     found = division_gains(
         movie.position,
         movie.shape,
@@ -187,18 +184,9 @@ def propose(
         log_rate,
         leave,
         appear,
-        first,
-        last,
         least,
+        _PER_MOTHER,
         cells,
         gain,
     )
-    cells, gain = cells[:found], gain[:found]
-    cells[:, 1] = candidates[cells[:, 0], cells[:, 1]]
-    cells[:, 2] = candidates[cells[:, 0], cells[:, 2]]
-    order = np.lexsort((-gain, cells[:, 0]))
-    cells, gain = cells[order], gain[order]
-    start = np.flatnonzero(np.r_[True, cells[1:, 0] != cells[:-1, 0]]) if found else order
-    rank = np.arange(found) - np.repeat(start, np.diff(np.append(start, found)))
-    keep = rank < _PER_MOTHER
-    return cells[keep], gain[keep]
+    return cells[:found].copy(), gain[:found].copy()

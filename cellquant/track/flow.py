@@ -2,10 +2,10 @@
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.spatial import cKDTree
 
 from cellquant.track.kernels import soft_flow
-from cellquant.track.movie import FloatArray, IntArray, Movie
+from cellquant.track.movie import FloatArray, Movie
+from cellquant.track.near import nearest_cells
 
 CANDIDATES = 10  # nearest cells around the predicted place that are considered at all
 _WIDTHS = (0.6, 0.2)  # of the soft assignment, first and last, in units of the spacing
@@ -25,10 +25,8 @@ def common_shift(here: FloatArray, there: FloatArray, spacing: float) -> FloatAr
     if len(here) > _VOTERS:
         here = here[:: -(-len(here) // _VOTERS)]
     reach = 2.0 * spacing
-    k = min(16, len(there))
-    distance, nearest = cKDTree(there).query(here, k, distance_upper_bound=reach)
-    distance, nearest = distance.reshape(len(here), k), nearest.reshape(len(here), k)
-    row, column = np.nonzero(np.isfinite(distance))
+    nearest, square = nearest_cells(here, there, 16)
+    row, column = np.nonzero(square < reach**2)
     if row.size == 0:
         return np.zeros(2)
     step = there[nearest[row, column]] - here[row]
@@ -40,15 +38,6 @@ def common_shift(here: FloatArray, there: FloatArray, spacing: float) -> FloatAr
     shift = np.array([centre[best[0]], centre[best[1]]])
     close = np.hypot(*(step - shift).T) < 0.3 * spacing
     return step[close].mean(axis=0) if close.any() else shift
-
-
-def nearest_cells(points: FloatArray, there: FloatArray, k: int = CANDIDATES) -> IntArray:
-    """Indices (n, k) of the cells nearest to each point; -1 where there are not so many."""
-    k_there = min(k, len(there))
-    found = np.full((len(points), k), -1, dtype=np.int64)
-    _, nearest = cKDTree(there).query(points, k_there)
-    found[:, :k_there] = nearest.reshape(len(points), k_there)
-    return found
 
 
 def pair_flow(movie: Movie, index: int, previous: FloatArray | None) -> FloatArray:
@@ -74,7 +63,7 @@ def pair_flow(movie: Movie, index: int, previous: FloatArray | None) -> FloatArr
     rounds = np.maximum(1, np.linspace(3, 0, _STEPS).round()).astype(np.int64)
 
     def follow(start: FloatArray) -> tuple[FloatArray, float]:
-        candidates = nearest_cells(here + start, there, min(_FLOW_CANDIDATES, len(there)))
+        candidates, _ = nearest_cells(here + start, there, min(_FLOW_CANDIDATES, len(there)))
         flow = start.copy()
         matched = soft_flow(here, there, candidates, neighbours, flow, widths, rounds, _OUTLIER)
         return flow, matched
@@ -88,24 +77,22 @@ def pair_flow(movie: Movie, index: int, previous: FloatArray | None) -> FloatArr
     return flow
 
 
-def all_flows(movie: Movie, *, local: bool = True) -> FloatArray:
+def all_flows(movie: Movie, *, local: bool = True) -> tuple[FloatArray, FloatArray]:
     """Displacement (N, 2) of the neighbourhood of each cell to the next frame; 0 in the last.
 
-    Without `local`, all cells of a frame share the most frequent displacement.
+    The second array (N, 2) is the flow per frame of the frame before, at the cells that it brings
+    nearest; 0 in the first. Without `local`, all cells of a frame share the most frequent
+    displacement.
     """
-    flow = np.zeros((movie.n_cells, 2))
-    previous: FloatArray | None = None
+    flow, carried = np.zeros((movie.n_cells, 2)), np.zeros((movie.n_cells, 2))
     for index in range(len(movie.time) - 1):
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
-        if not local:
-            spacing = min(movie.spacing[index], movie.spacing[index + 1])
-            flow[a] = common_shift(movie.position[a], movie.position[b], spacing)
-            continue
-        flow[a] = pair_flow(movie, index, previous)
-        if index + 2 < len(movie.time):
-            arrived = movie.position[a] + flow[a]
-            _, nearest = cKDTree(arrived).query(movie.position[b])
-            elapsed = movie.time[index + 1] - movie.time[index]
-            ahead = movie.time[index + 2] - movie.time[index + 1]
-            previous = flow[a][nearest] * (ahead / elapsed)
-    return flow
+        here, there = movie.position[a], movie.position[b]
+        elapsed = float(movie.time[index + 1] - movie.time[index])
+        if local:
+            flow[a] = pair_flow(movie, index, carried[a] * elapsed if index > 0 else None)
+        else:
+            flow[a] = common_shift(here, there, min(movie.spacing[index], movie.spacing[index + 1]))
+        origin, _ = nearest_cells(there, here + flow[a], 1)
+        carried[b] = flow[a][origin[:, 0]] / elapsed
+    return flow, carried

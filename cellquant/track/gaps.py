@@ -1,11 +1,11 @@
 """Gaps: cells that were missed for a few frames, joined by a global pass over the ends."""
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cellquant.track.assign import match
 from cellquant.track.costs import Shapes
 from cellquant.track.movie import FloatArray, IntArray, Movie
+from cellquant.track.near import nearest_cells
 from cellquant.track.solve import Solution
 
 _NEAREST = 6
@@ -67,7 +67,6 @@ def _candidates(
     spans: list[IntArray] = []
     n_frames = len(movie.time)
     frame_of = movie.frame_index
-    trees: dict[int, cKDTree] = {}
     for index in range(n_frames - 2):
         ends = ends_all[frame_of[ends_all] == index]
         if len(ends) == 0:
@@ -79,15 +78,13 @@ def _candidates(
                 break
             # The flow of the missing frame, read where the cell would be.
             bridge = movie.cells_of(later - 1)
-            if later - 1 not in trees:
-                trees[later - 1] = cKDTree(movie.position[bridge])
-            _, nearest = trees[later - 1].query(place)
-            place = place + flow[bridge][nearest]
+            nearest, _ = nearest_cells(place, movie.position[bridge], 1)
+            place = place + flow[bridge][nearest[:, 0]]
             starts = starts_all[frame_of[starts_all] == later]
             if len(starts) == 0:
                 continue
             k = min(_NEAREST, len(starts))
-            _, found = cKDTree(movie.position[starts]).query(place, k)
+            found, _ = nearest_cells(place, movie.position[starts], k)
             row = np.repeat(np.arange(len(ends)), k)
             column = found.reshape(-1)
             a, b = ends[row], starts[column]

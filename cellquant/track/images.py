@@ -20,8 +20,7 @@ _MEET = 0.7  # roots of the area; round cells of one size touch at 1.1
 class PairImages:
     """Compares cells of successive frames in the masks, and in the raw movie when there is one.
 
-    Frames are read when they are asked for, and two are kept at a time; what was compared once is
-    remembered.
+    Frames are read when they are asked for, and two are kept at a time.
     """
 
     def __init__(
@@ -44,12 +43,10 @@ class PairImages:
         self._stride = max(1, int(np.sqrt(typical / _SAMPLES)))
         self._patch = max(2, round(1.2 * float(np.sqrt(typical / np.pi))))
         self._kept: dict[tuple[bool, int], np.ndarray[Any, Any]] = {}
-        self._families: dict[tuple[int, int, int], FloatArray] = {}
 
     def expect(self, place: FloatArray) -> None:
         """Set where each cell (N, 2) is expected in the next frame."""
         self._expected = place / self._pixel_size
-        self._families.clear()
 
     def _frame(self, index: int, *, raw: bool) -> np.ndarray[Any, Any]:
         key = (raw, index)
@@ -61,19 +58,18 @@ class PairImages:
             self._kept[key] = stack[place]
         return self._kept[key]
 
-    def families(self, index: int, cells: IntArray) -> list[Look]:
+    def families(self, cells: IntArray) -> list[Look]:
         """Compare mothers with two daughters taken together, laid on each other; cells (L, 3).
 
         The first look is at the logarithm of the intersection over union, and depends on either
-        change of area; the second is as that of `pairs`.
+        change of area; the second is as that of `pairs`. Rows are in the order of their mothers.
         """
-        keys = [tuple(row) for row in cells.tolist()]
-        new = np.array([key not in self._families for key in keys], dtype=bool)
-        if new.any():
-            rows = self._compare_families(index, *cells[new].T)
-            for key, row in zip(cells[new].tolist(), rows, strict=True):
-                self._families[tuple(key)] = row
-        known = np.array([self._families[key] for key in keys])
+        frame = self._movie.frame_index[cells[:, 0]]
+        parts = []
+        for index in np.unique(frame).tolist():
+            first, last = np.searchsorted(frame, (index, index + 1))
+            parts.append(self._compare_families(index, *cells[first:last].T))
+        known = np.concatenate(parts)
         values = known[:, : len(known[0]) - 5]
         return [Look(value, known[:, -5:-1], known[:, -1]) for value in values.T]
 

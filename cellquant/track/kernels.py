@@ -113,43 +113,61 @@ def neighbour_mean(
 
 @njit(cache=True)
 def marginals(
-    gain: FloatArray, candidates: IntArray, n_columns: int, rounds: int, out: FloatArray
+    gain: FloatArray,
+    candidates: IntArray,
+    start: IntArray,
+    rounds: int,
+    least: float,
+    out: FloatArray,
 ) -> None:
-    """Probability of every candidate link by belief propagation, out (n, k).
+    """Probability of every candidate link by belief propagation, out (N, K).
 
     ``exp(gain)`` is the odds of a link against neither cell having a partner; candidates below 0
-    are none. Exact where the candidate graph is a tree, and close to it elsewhere.
+    are none, and gains below `least` count as none. Candidates are cells of the next frame, frames
+    begin at start (P + 1,). Exact where the candidate graph is a tree, and close to it elsewhere.
     """
-    n, k = candidates.shape
     # Gains beyond this change no probability, but their sums would swallow the 1 of "no partner".
     limit = 25.0
-    odds = np.zeros((n, k))
-    from_column = np.ones((n, k))
-    from_row = np.ones((n, k))
-    for i in range(n):
-        for c in range(k):
-            if candidates[i, c] >= 0:
-                odds[i, c] = np.exp(min(max(gain[i, c], -2 * limit), limit))
-    total_column = np.empty(n_columns)
-    for _ in range(rounds):
-        total_column[:] = 1.0
-        for i in range(n):
-            total = 1.0
-            for c in range(k):
-                total += odds[i, c] * from_column[i, c]
-            for c in range(k):
-                from_row[i, c] = 1.0 / max(total - odds[i, c] * from_column[i, c], 1.0)
-                if candidates[i, c] >= 0:
-                    total_column[candidates[i, c]] += odds[i, c] * from_row[i, c]
+    k = candidates.shape[1]
+    most = 0
+    for p in range(len(start) - 1):
+        most = max(most, start[p + 1] - start[p])
+    odds, from_row, from_column = np.empty(most * k), np.empty(most * k), np.empty(most * k)
+    target, end = np.empty(most * k, dtype=np.int64), np.empty(most + 1, dtype=np.int64)
+    total_column = np.empty(most)
+    out[:] = 0.0
+    for p in range(len(start) - 2):
+        first, n, there = start[p], start[p + 1] - start[p], start[p + 1]
+        links = 0
         for i in range(n):
             for c in range(k):
-                if candidates[i, c] >= 0:
-                    rest = total_column[candidates[i, c]] - odds[i, c] * from_row[i, c]
-                    from_column[i, c] = 1.0 / max(rest, 1.0)
-    for i in range(n):
-        for c in range(k):
-            belief = odds[i, c] * from_row[i, c] * from_column[i, c]
-            out[i, c] = belief / (1.0 + belief)
+                if candidates[first + i, c] >= 0 and gain[first + i, c] >= least:
+                    target[links] = candidates[first + i, c] - there
+                    odds[links] = np.exp(min(gain[first + i, c], limit))
+                    from_column[links] = 1.0
+                    links += 1
+            end[i] = links
+        for _ in range(rounds):
+            total_column[:] = 1.0
+            begin = 0
+            for i in range(n):
+                total = 1.0
+                for q in range(begin, end[i]):
+                    total += odds[q] * from_column[q]
+                for q in range(begin, end[i]):
+                    from_row[q] = 1.0 / max(total - odds[q] * from_column[q], 1.0)
+                    total_column[target[q]] += odds[q] * from_row[q]
+                begin = end[i]
+            for q in range(links):
+                rest = total_column[target[q]] - odds[q] * from_row[q]
+                from_column[q] = 1.0 / max(rest, 1.0)
+        q = 0
+        for i in range(n):
+            for c in range(k):
+                if candidates[first + i, c] >= 0 and gain[first + i, c] >= least:
+                    belief = odds[q] * from_row[q] * from_column[q]
+                    out[first + i, c] = belief / (1.0 + belief)
+                    q += 1
 
 
 @njit(cache=True)
@@ -247,7 +265,7 @@ def division_gains(
     shape: FloatArray,
     cut: BoolArray,
     candidates: IntArray,
-    orphan: IntArray,
+    orphan: BoolArray,
     middle: FloatArray,
     width: FloatArray,
     tail: float,
@@ -258,9 +276,8 @@ def division_gains(
     prior: FloatArray,
     leave: FloatArray,
     appear: FloatArray,
-    first: int,
-    last: int,
     least: float,
+    most: int,
     out_cells: IntArray,
     out_gain: FloatArray,
 ) -> int:
@@ -271,12 +288,13 @@ def division_gains(
     their ratio, unless (with chance 1 - ratios[3]) their sizes tell nothing. Mother and daughters
     are elongated along their line by `stretch` (mother, daughters, any cell: mean, width along,
     width across; Student density). population (N,) is the log density of sizes at each cell.
-    Writes (mother, column and column of the daughters among its candidates), as many as fit.
+    Writes (mother, daughter, daughter), at most `most` per mother, best first.
     """
     k = candidates.shape[1]
     nu = 5.0
-    found = 0
-    for i in range(first, last):
+    last = 0
+    for i in range(len(candidates)):
+        first = last
         for c in range(k):
             j = candidates[i, c]
             if j < 0 or not orphan[j] or cut[j]:
@@ -317,13 +335,17 @@ def division_gains(
                     value += (nu / 2 + 1) * (np.log1p(far / nu) - np.log1p(near / nu))
                     value += np.log(stretch[2, 1] ** 2 / (stretch[role, 1] * stretch[role, 2]))
                 value += prior[i] - leave[i] - appear[j] - appear[h]
-                if value > least and found < len(out_gain):
-                    out_cells[found, 0] = i
-                    out_cells[found, 1] = c
-                    out_cells[found, 2] = d
-                    out_gain[found] = value
-                    found += 1
-    return found
+                if value <= least or (last - first == most and value <= out_gain[last - 1]):
+                    continue
+                place = last if last - first < most else last - 1
+                last = place + 1
+                while place > first and out_gain[place - 1] < value:
+                    out_gain[place] = out_gain[place - 1]
+                    out_cells[place] = out_cells[place - 1]
+                    place -= 1
+                out_gain[place] = value
+                out_cells[place, 0], out_cells[place, 1], out_cells[place, 2] = i, j, h
+    return last
 
 
 @njit(cache=True)

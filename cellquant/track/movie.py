@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cellquant.tables import Cells
+from cellquant.track.near import nearest_cells
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
@@ -148,7 +148,8 @@ def _surroundings(position: FloatArray, area: float) -> tuple[IntArray, float, F
     found = np.repeat(np.arange(n)[:, None], WIDE, axis=1)
     if k == 0:
         return found, float(np.sqrt(area)), np.full(n, 1.0 / area)
-    distance, nearest = cKDTree(position).query(position, k + 1)
+    nearest, square = nearest_cells(position, position, k + 1)
+    distance = np.sqrt(square)
     # Coinciding centroids can put another cell first; the own index is then somewhere in the row.
     own = nearest == np.arange(n)[:, None]
     own[~own.any(axis=1), -1] = True

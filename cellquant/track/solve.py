@@ -11,7 +11,6 @@ from cellquant.track.costs import (
     Motion,
     Paths,
     Shapes,
-    carried_flow,
     expected_steps,
     first_motion,
     fit_motion,
@@ -22,16 +21,19 @@ from cellquant.track.costs import (
 from cellquant.track.cues import Cue, Look, evidence, fit_cue, joined
 from cellquant.track.divisions import Divisions, fit_divisions, propose
 from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
-from cellquant.track.flow import CANDIDATES, all_flows, nearest_cells
+from cellquant.track.flow import CANDIDATES, all_flows
 from cellquant.track.images import PairImages
 from cellquant.track.kernels import marginals
 from cellquant.track.movie import BoolArray, FloatArray, IntArray, Links, Movie
+from cellquant.track.near import nearest_cells
 
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
 
 PASSES = 5
 _UNLIKELY = 1e-4  # links below this probability are not offered to the assignment
+_MARGIN = 3.0  # of log odds below that, where links no longer matter to their rivals
+_SWEEPS = 6  # of belief propagation
 _SURE = 0.99  # a cell whose mother is known with this probability needs no division
 _DIVISION_PASS = 1  # the first pass that looks for divisions
 _IMAGE_PASS = 2  # the first pass that looks at the images
@@ -147,14 +149,13 @@ def solve(
 
 
 def _start(movie: Movie, options: Options) -> Solution:
-    flow = all_flows(movie, local=options.use_neighbours)
+    flow, carried = all_flows(movie, local=options.use_neighbours)
     candidates = np.full((movie.n_cells, CANDIDATES), -1, dtype=np.int64)
     for index in range(len(movie.time) - 1):
         a, b = movie.cells_of(index), movie.cells_of(index + 1)
-        found = nearest_cells(movie.position[a] + flow[a], movie.position[b])
+        found, _ = nearest_cells(movie.position[a] + flow[a], movie.position[b], CANDIDATES)
         candidates[a] = np.where(found >= 0, found + movie.start[index + 1], -1)
     leaving, entering = places(movie, flow)
-    carried = carried_flow(movie, flow)
     return Solution(
         movie=movie,
         flow=flow,
@@ -231,14 +232,13 @@ def _compare(state: Solution, images: PairImages) -> tuple[IntArray, list[Look]]
 
 
 def _families(
-    state: Solution, index: int, orphan: IntArray, middle: FloatArray, images: PairImages | None
+    state: Solution, orphan: BoolArray, middle: FloatArray, images: PairImages | None
 ) -> tuple[IntArray, FloatArray, list[Look]]:
-    """Divisions worth considering between frame `index` and the next, and their log odds."""
+    """Divisions worth considering, their log odds, and how the images of them look."""
     assert state.divisions is not None
     assert state.fates is not None
     cells, gain = propose(
         state.movie,
-        index,
         state.candidates,
         orphan,
         middle,
@@ -251,7 +251,7 @@ def _families(
     )
     if images is None or len(gain) == 0:
         return cells, gain, []
-    looks = images.families(index, cells)
+    looks = images.families(cells)
     return cells, gain + evidence(state.family_cues, looks), looks
 
 
@@ -259,48 +259,28 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
     movie, candidates, gain = state.movie, state.candidates, state.gain
     assert gain is not None
     n = movie.n_cells
+    probability = state.probability = np.empty(candidates.shape)
+    marginals(gain, candidates, movie.start, _SWEEPS, np.log(_UNLIKELY) - _MARGIN, probability)
+    row, slot = np.nonzero(probability > _UNLIKELY)
+    column, sure = candidates[row, slot], probability[row, slot]
+    families, odds = np.empty((0, 3), dtype=np.int64), np.empty(0)
+    looks: list[Look] = []
+    if state.divisions is not None:
+        reached = np.zeros(n)
+        np.maximum.at(reached, column, sure)
+        families, odds, looks = _families(state, reached < _SURE, middle, images)
+    chosen, split = match_with_divisions(row, column, gain[row, slot], families, odds)
+    if looks:
+        taken = np.zeros(len(odds), dtype=bool)
+        taken[split] = True
+        state.family_cues = [fit_cue(look, taken, ~taken) for look in looks]
     after = np.full(n, -1, dtype=np.int64)
     second, before = after.copy(), after.copy()
     confidence = np.zeros(n)
-    everywhere = state.probability = np.zeros(candidates.shape)
-    looks: list[list[Look]] = []
-    looks_taken: list[BoolArray] = []
-    for index in range(len(movie.time) - 1):
-        a, b = movie.cells_of(index), movie.cells_of(index + 1)
-        n_there = b.stop - b.start
-        local = np.where(candidates[a] >= 0, candidates[a] - b.start, -1)
-        probability = everywhere[a]
-        marginals(gain[a], local, n_there, 6, probability)
-        row, column = np.nonzero(probability > _UNLIKELY)
-        rows, columns = row + a.start, candidates[a][row, column]
-        value = gain[a][row, column]
-        families = np.empty((0, 3), dtype=np.int64)
-        odds = np.empty(0)
-        seen: list[Look] = []
-        if state.divisions is not None:
-            reached = np.zeros(n_there)
-            np.maximum.at(reached, local[row, column], probability[row, column])
-            orphan = np.zeros(n, dtype=np.int64)
-            orphan[b] = reached < _SURE
-            families, odds, seen = _families(state, index, orphan, middle, images)
-        chosen, split = match_with_divisions(rows, columns, value, families, odds)
-        if seen:
-            taken = np.zeros(len(odds), dtype=bool)
-            taken[split] = True
-            looks.append(seen)
-            looks_taken.append(taken)
-        after[rows[chosen]] = columns[chosen]
-        before[columns[chosen]] = rows[chosen]
-        confidence[columns[chosen]] = probability[row[chosen], column[chosen]]
-        for mother, one, two in families[split]:
-            after[mother], second[mother] = one, two
-            before[one] = before[two] = mother
-        confidence[families[split, 1]] = confidence[families[split, 2]] = 1.0 / (
-            1.0 + np.exp(-np.minimum(odds[split], 50.0))
-        )
-    if looks:
-        taken = np.concatenate(looks_taken)
-        state.family_cues = [
-            fit_cue(joined(list(kind)), taken, ~taken) for kind in zip(*looks, strict=True)
-        ]
+    row, column = row[chosen], column[chosen]
+    after[row], before[column], confidence[column] = column, row, sure[chosen]
+    mother, one, two = families[split].T
+    after[mother], second[mother] = one, two
+    before[one] = before[two] = mother
+    confidence[one] = confidence[two] = 1.0 / (1.0 + np.exp(-np.minimum(odds[split], 50.0)))
     return Links(after, second, before, confidence)
