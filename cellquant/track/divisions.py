@@ -41,6 +41,7 @@ def fit_divisions(
     movie: Movie,
     links: Links | None,
     middle: FloatArray,
+    population: FloatArray,
     *,
     spread: FloatArray,
     width: float,
@@ -48,12 +49,11 @@ def fit_divisions(
 ) -> Divisions:
     """Estimate the daughters' geometry from the divisions found, with a weak general prior.
 
-    `width`, `tail` and `spread` (N,) are those of single cells' steps around `middle` (N, 2),
-    where they are expected.
+    `population` (N,) is the `log_frequency` of the cells' sizes. `width`, `tail` and `spread` (N,)
+    are those of single cells' steps around `middle` (N, 2), where they are expected.
     """
     area = movie.shape[:, LOG_AREA]
     centre = float(np.median(area))
-    population = log_frequency(area)
     spacing = float(np.median(movie.spacing))
     mothers = np.empty(0, dtype=np.int64)
     if links is not None:

@@ -17,6 +17,7 @@ _MOST = 0.5
 _EVEN_FRAMES = (30.0, 1e6)  # cells that a frame needs to have a rate of its own: least and most
 _PRIOR_SIZES = 20.0
 _SIZE_FLOOR = 0.05
+_SIZE_LIMITS = (np.exp(-3.0), np.exp(3.0))
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ def _size_law(values: FloatArray, prior: tuple[float, float] | None) -> tuple[fl
 def _size_ratio(size: FloatArray, among: FloatArray, usual: tuple[float, float]) -> FloatArray:
     """How much likelier each size (N,) is among some cells than usual, within a factor of 20."""
     mean, width = _size_law(among, usual)
+    # The cube of the ratio of both terms is the ratio of two Student densities.
     near, far = (size - mean) / width, (size - usual[0]) / usual[1]
-    odds = 3.0 * (np.log1p(far**2 / 5.0) - np.log1p(near**2 / 5.0)) + np.log(usual[1] / width)
-    ratio: FloatArray = np.exp(np.clip(odds, -3.0, 3.0))
-    return ratio
+    ratio: FloatArray = (5.0 + far**2) / (5.0 + near**2)
+    return np.clip(ratio**3 * (usual[1] / width), *_SIZE_LIMITS)

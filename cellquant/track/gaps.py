@@ -3,7 +3,6 @@
 import numpy as np
 
 from cellquant.track.assign import match
-from cellquant.track.costs import Shapes
 from cellquant.track.movie import FloatArray, IntArray, Movie
 from cellquant.track.near import nearest_cells
 from cellquant.track.solve import Solution
@@ -66,9 +65,10 @@ def _candidates(
     values: list[FloatArray] = []
     spans: list[IntArray] = []
     n_frames = len(movie.time)
-    frame_of = movie.frame_index
+    ends_of = np.searchsorted(ends_all, movie.start)
+    starts_of = np.searchsorted(starts_all, movie.start)
     for index in range(n_frames - 2):
-        ends = ends_all[frame_of[ends_all] == index]
+        ends = ends_all[ends_of[index] : ends_of[index + 1]]
         if len(ends) == 0:
             continue
         place = movie.position[ends] + flow[ends]
@@ -80,7 +80,7 @@ def _candidates(
             bridge = movie.cells_of(later - 1)
             nearest, _ = nearest_cells(place, movie.position[bridge], 1)
             place = place + flow[bridge][nearest[:, 0]]
-            starts = starts_all[frame_of[starts_all] == later]
+            starts = starts_all[starts_of[later] : starts_of[later + 1]]
             if len(starts) == 0:
                 continue
             k = min(_NEAREST, len(starts))
@@ -94,11 +94,7 @@ def _candidates(
             nu = motion.tail[0]
             value = -np.log(2 * np.pi * width**2)
             value = value - (nu / 2 + 1) * np.log1p(np.sum(away**2, axis=1) / (nu * width**2))
-            value += (
-                shape_odds(movie, shapes, a, b)
-                - solution.fates.vanish[a]
-                - solution.fates.appear[b]
-            )
+            value += shapes.odds(a, b) - solution.fates.vanish[a] - solution.fates.appear[b]
             value[raw > max_distance * span] = -np.inf
             sources.append(a)
             targets.append(b)
@@ -113,21 +109,3 @@ def _candidates(
         np.concatenate(values),
         np.concatenate(spans),
     )
-
-
-def shape_odds(movie: Movie, shapes: Shapes, source: IntArray, target: IntArray) -> FloatArray:
-    """Log odds (L,) that the shapes belong to one cell rather than to two."""
-    a, b = movie.shape[source] - shapes.typical, movie.shape[target] - shapes.typical
-    change = b - shapes.memory * a
-    near = np.einsum("nf,fg,ng->n", change, shapes.link_precision, change)
-    near /= shapes.spread[source] ** 2
-    far = np.einsum("nf,fg,ng->n", b, shapes.population_precision, b)
-    tail, f = 5.0, b.shape[1]
-    odds: FloatArray = (
-        shapes.constant
-        - f * np.log(shapes.spread[source])
-        - (tail + f) / 2 * (np.log1p(near / tail) - np.log1p(far / tail))
-    )
-    known = shapes.informative[source]
-    mixed: FloatArray = np.log(1.0 - known + known * np.exp(odds))
-    return mixed

@@ -78,24 +78,96 @@ def soft_flow(
 
 
 @njit(cache=True)
+def widest_gaps(position: FloatArray, neighbours: IntArray, out: FloatArray) -> None:
+    """Widest angle out (N,) around each cell that holds none of its neighbours (N, K), K >= 1."""
+    k = neighbours.shape[1]
+    angle = np.empty(k)
+    for i in range(len(position)):
+        for c in range(k):
+            j = neighbours[i, c]
+            value = np.arctan2(position[j, 1] - position[i, 1], position[j, 0] - position[i, 0])
+            place = c
+            while place > 0 and angle[place - 1] > value:
+                angle[place] = angle[place - 1]
+                place -= 1
+            angle[place] = value
+        out[i] = angle[0] + 2.0 * np.pi - angle[k - 1]
+        for c in range(1, k):
+            out[i] = max(out[i], angle[c] - angle[c - 1])
+
+
+@njit(cache=True)
+def link_steps(
+    position: FloatArray,
+    start: IntArray,
+    elapsed: FloatArray,
+    after: IntArray,
+    second: IntArray,
+    confidence: FloatArray,
+    flow: FloatArray,
+    drift: FloatArray,
+    own_after: FloatArray,
+    own_before: FloatArray,
+    has_after: IntArray,
+    has_before: IntArray,
+    left: FloatArray,
+    arrived: FloatArray,
+) -> None:
+    """Displacements per frame along links, relative to the median of their frame.
+
+    Writes drift (P, 2), own_after and own_before (N, 2) with has_after, has_before (N,), and the
+    confidence of the link that leaves and of the one that arrives (N,); all zero where no single
+    link is. The median is that of the flow where fewer than three links are trusted.
+    """
+    for p in range(len(start) - 2):
+        first, n = start[p], start[p + 1] - start[p]
+        steps = np.empty((2, n))
+        trusted = 0
+        for i in range(first, first + n):
+            j = after[i]
+            if j < 0 or second[i] >= 0:
+                continue
+            for d in range(2):
+                own_after[i, d] = (position[j, d] - position[i, d]) / elapsed[i]
+            left[i] = arrived[j] = confidence[j]
+            has_after[i] = has_before[j] = 1
+            if confidence[j] > 0.3:
+                steps[0, trusted], steps[1, trusted] = own_after[i]
+                trusted += 1
+        for d in range(2):
+            if trusted >= 3:
+                drift[p, d] = np.median(steps[d, :trusted])
+            elif n > 0:
+                drift[p, d] = np.median(flow[first : first + n, d])
+        for i in range(first, first + n):
+            if has_after[i]:
+                for d in range(2):
+                    own_after[i, d] -= drift[p, d]
+                    own_before[after[i], d] = own_after[i, d]
+
+
+@njit(cache=True)
 def neighbour_mean(
     displacement: FloatArray,
     weight: FloatArray,
     neighbours: IntArray,
     near: int,
-    fallback: FloatArray,
+    field: FloatArray,
+    shift: FloatArray,
+    frame: IntArray,
     prior: float,
     out: FloatArray,
 ) -> None:
-    """Weighted mean displacement of the neighbours at two scales, out (n, 2, 2).
+    """Weighted mean displacement of the neighbours at two scales, out (N, 2, 2).
 
-    Each mean carries `prior` weight of the fallback, which alone decides where no neighbour has a
-    displacement.
+    Each mean carries `prior` weight of the field less the shift of the frame, which alone decides
+    where no neighbour has a displacement.
     """
     n, m = neighbours.shape
     for i in range(n):
         x = y = 0.0
         mass = 0.0
+        fx, fy = field[i, 0] - shift[frame[i], 0], field[i, 1] - shift[frame[i], 1]
         for scale in range(2):
             first = 0 if scale == 0 else near
             last = near if scale == 0 else m
@@ -107,8 +179,33 @@ def neighbour_mean(
                 mass += w
                 x += w * displacement[j, 0]
                 y += w * displacement[j, 1]
-            out[i, scale, 0] = (x + prior * fallback[i, 0]) / (mass + prior)
-            out[i, scale, 1] = (y + prior * fallback[i, 1]) / (mass + prior)
+            out[i, scale, 0] = (x + prior * fx) / (mass + prior)
+            out[i, scale, 1] = (y + prior * fy) / (mass + prior)
+
+
+@njit(cache=True)
+def steps_ahead(
+    around_after: FloatArray,
+    around_before: FloatArray,
+    own_before: FloatArray,
+    has_before: IntArray,
+    drift: FloatArray,
+    frame: IntArray,
+    elapsed: FloatArray,
+    coefficients: FloatArray,
+    own_path: bool,
+    out: FloatArray,
+) -> None:
+    """Expected displacements, out (N, 2), of cells whose partners are not known.
+
+    What the partner's neighbourhood does now is what the own neighbourhood does now.
+    """
+    for i in range(len(out)):
+        b = coefficients[2 * has_before[i] if own_path else 0]
+        for d in range(2):
+            step = (b[0] + b[3]) * around_after[i, 0, d] + b[1] * around_after[i, 1, d]
+            step += b[2] * around_before[i, 0, d] + b[5] * own_before[i, d]
+            out[i, d] = (drift[frame[i], d] + step) * elapsed[i]
 
 
 @njit(cache=True)
@@ -118,6 +215,7 @@ def marginals(
     start: IntArray,
     rounds: int,
     least: float,
+    certain: float,
     out: FloatArray,
 ) -> None:
     """Probability of every candidate link by belief propagation, out (N, K).
@@ -125,6 +223,8 @@ def marginals(
     ``exp(gain)`` is the odds of a link against neither cell having a partner; candidates below 0
     are none, and gains below `least` count as none. Candidates are cells of the next frame, frames
     begin at start (P + 1,). Exact where the candidate graph is a tree, and close to it elsewhere.
+    A link whose log odds are above `certain` whatever its rivals do is not propagated, and they are
+    dropped.
     """
     # Gains beyond this change no probability, but their sums would swallow the 1 of "no partner".
     limit = 25.0
@@ -133,41 +233,77 @@ def marginals(
     for p in range(len(start) - 1):
         most = max(most, start[p + 1] - start[p])
     odds, from_row, from_column = np.empty(most * k), np.empty(most * k), np.empty(most * k)
-    target, end = np.empty(most * k, dtype=np.int64), np.empty(most + 1, dtype=np.int64)
-    total_column = np.empty(most)
+    source, target = np.empty(most * k, dtype=np.int64), np.empty(most * k, dtype=np.int64)
+    place = np.empty(most * k, dtype=np.int64)
+    total_row, total_column = np.empty(most), np.empty(most)
+    first_row, first_column = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
+    second_row, top_column, second_column = np.empty(most), np.empty(most), np.empty(most)
+    rivals = np.empty(most, dtype=np.int64)
+    closed_row, closed_column = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
     out[:] = 0.0
     for p in range(len(start) - 2):
         first, n, there = start[p], start[p + 1] - start[p], start[p + 1]
+        top_column[:] = -np.inf
+        second_column[:] = -np.inf
+        first_column[:] = -1
+        rivals[:] = -1
+        closed_row[:] = False
+        closed_column[:] = False
+        for i in range(n):
+            best, top, second = -1, -np.inf, -np.inf
+            for c in range(k):
+                g, j = gain[first + i, c], candidates[first + i, c] - there
+                if j < 0:
+                    continue
+                rivals[j] += 1
+                if g > top:
+                    best, top, second = c, g, top
+                elif g > second:
+                    second = g
+                if g > top_column[j]:
+                    top_column[j], second_column[j], first_column[j] = g, top_column[j], i
+                elif g > second_column[j]:
+                    second_column[j] = g
+            first_row[i], second_row[i] = best, second
+        # Where the rivals together cannot bring a link below certainty, they are out of question.
+        for i in range(n):
+            c = first_row[i]
+            if c < 0 or gain[first + i, c] <= certain:
+                continue
+            j = candidates[first + i, c] - there
+            if first_column[j] != i:
+                continue
+            g = gain[first + i, c]
+            g -= np.log(1.0 + (k - 1) * np.exp(second_row[i]))
+            g -= np.log(1.0 + rivals[j] * np.exp(second_column[j]))
+            if g > certain:
+                out[first + i, c] = 1.0 / (1.0 + np.exp(-g))
+                closed_row[i] = closed_column[j] = True
         links = 0
         for i in range(n):
+            if closed_row[i]:
+                continue
             for c in range(k):
-                if candidates[first + i, c] >= 0 and gain[first + i, c] >= least:
-                    target[links] = candidates[first + i, c] - there
-                    odds[links] = np.exp(min(gain[first + i, c], limit))
-                    from_column[links] = 1.0
+                g, j = gain[first + i, c], candidates[first + i, c] - there
+                if j >= 0 and g >= least and not closed_column[j]:
+                    source[links], target[links], place[links] = i, j, c
+                    odds[links], from_column[links] = np.exp(min(g, limit)), 1.0
                     links += 1
-            end[i] = links
         for _ in range(rounds):
+            total_row[:] = 1.0
             total_column[:] = 1.0
-            begin = 0
-            for i in range(n):
-                total = 1.0
-                for q in range(begin, end[i]):
-                    total += odds[q] * from_column[q]
-                for q in range(begin, end[i]):
-                    from_row[q] = 1.0 / max(total - odds[q] * from_column[q], 1.0)
-                    total_column[target[q]] += odds[q] * from_row[q]
-                begin = end[i]
+            for q in range(links):
+                total_row[source[q]] += odds[q] * from_column[q]
+            for q in range(links):
+                rest = total_row[source[q]] - odds[q] * from_column[q]
+                from_row[q] = 1.0 / max(rest, 1.0)
+                total_column[target[q]] += odds[q] * from_row[q]
             for q in range(links):
                 rest = total_column[target[q]] - odds[q] * from_row[q]
                 from_column[q] = 1.0 / max(rest, 1.0)
-        q = 0
-        for i in range(n):
-            for c in range(k):
-                if candidates[first + i, c] >= 0 and gain[first + i, c] >= least:
-                    belief = odds[q] * from_row[q] * from_column[q]
-                    out[first + i, c] = belief / (1.0 + belief)
-                    q += 1
+        for q in range(links):
+            belief = odds[q] * from_row[q] * from_column[q]
+            out[first + source[q], place[q]] = belief / (1.0 + belief)
 
 
 @njit(cache=True)
@@ -181,9 +317,10 @@ def pair_gains(
     own_after: FloatArray,
     has_before: IntArray,
     has_after: IntArray,
-    around: FloatArray,
-    drift: FloatArray,
     around_after: FloatArray,
+    around_before: FloatArray,
+    drift: FloatArray,
+    frame: IntArray,
     coefficients: FloatArray,
     scale: FloatArray,
     tail: FloatArray,
@@ -197,6 +334,7 @@ def pair_gains(
     leave: FloatArray,
     appear: FloatArray,
     max_distance: float,
+    doubt: float,
     gain: FloatArray,
 ) -> None:
     """Log odds of every candidate link against death of one cell and birth of the other.
@@ -206,57 +344,82 @@ def pair_gains(
     the density of shapes in the population, unless the edge of the view cuts one of them.
     shape_after and shape_expected (N, F) are each cell's descriptors, and those expected of its
     successor, in units of their scatter; unlike (N,) is the negative log density of each shape in
-    the population, up to the constants of both densities.
+    the population, up to the constants of both densities. Shapes are compared where the best of
+    them could bring a candidate within `doubt` of the likeliest of its cell.
     """
     n, k = candidates.shape
     f = shape_after.shape[1]
     half = (shape_tail + f) / 2
+    kinds = len(scale)
     height = -np.log(2 * np.pi * scale**2)
+    power = tail / 2 + 1
+    # What partners bring to the prediction, for cells without and with a step before.
+    partner = np.empty((n, 2, 2))
+    for j in range(n):
+        for before in range(2):
+            b = coefficients[2 * before + has_after[j]]
+            for d in range(2):
+                value = b[3] * around_before[j, 0, d] + b[4] * around_after[j, 0, d]
+                if has_after[j]:
+                    value += b[6] * own_after[j, d]
+                partner[j, before, d] = value
+    ahead, inverse, step = np.empty((2, 2)), np.empty(kinds), np.empty(k)
     for i in range(n):
+        before = has_before[i]
+        for after in range(2):
+            b = coefficients[2 * before + after]
+            for d in range(2):
+                value = drift[frame[i], d] + b[0] * around_after[i, 0, d]
+                value += b[1] * around_after[i, 1, d] + b[2] * around_before[i, 0, d]
+                if before:
+                    value += b[5] * own_before[i, d]
+                ahead[after, d] = value
+            width = scale[2 * before + after] * spread[i]
+            inverse[after] = elapsed[i] ** 2 / (width * width * tail[2 * before + after])
         wide = f * np.log(shape_spread[i])
         fate = stay[i] - leave[i] - 2.0 * np.log(spread[i])
+        best, most = -1, -np.inf
         for c in range(k):
             j = candidates[i, c]
+            step[c] = -np.inf
             if j < 0:
-                gain[i, c] = -np.inf
                 continue
             dx = position[j, 0] - position[i, 0]
             dy = position[j, 1] - position[i, 1]
             if dx * dx + dy * dy > max_distance * max_distance:
-                gain[i, c] = -np.inf
                 continue
-            kind = 2 * has_before[i] + has_after[j]
-            rx = dx / elapsed[i] - drift[i, 0]
-            ry = dy / elapsed[i] - drift[i, 1]
-            b = coefficients[kind]
-            for d in range(3):
-                rx -= b[d] * around[i, d, 0]
-                ry -= b[d] * around[i, d, 1]
-            for d in range(2):
-                rx -= b[3 + d] * around_after[j, d, 0]
-                ry -= b[3 + d] * around_after[j, d, 1]
-            if has_before[i]:
-                rx -= b[5] * own_before[i, 0]
-                ry -= b[5] * own_before[i, 1]
-            if has_after[j]:
-                rx -= b[6] * own_after[j, 0]
-                ry -= b[6] * own_after[j, 1]
-            width = scale[kind] * spread[i]
-            nu = tail[kind]
-            distance = (rx * rx + ry * ry) * elapsed[i] * elapsed[i] / (width * width * nu)
-            value = height[kind] + fate - appear[j] - (nu / 2 + 1) * np.log1p(distance)
-            # No shape makes up for such a step.
-            if cut[i] or cut[j] or value < -30.0:
-                gain[i, c] = value
-                continue
-            near = 0.0
-            for d in range(f):
-                near += (shape_after[j, d] - shape_expected[i, d]) ** 2
-            near /= shape_spread[i] ** 2 * shape_tail
-            odds = unlike[j] - wide - half * np.log1p(near)
-            if informative[i] < 1.0:
-                odds = np.log(1.0 - informative[i] + informative[i] * np.exp(odds))
-            gain[i, c] = value + odds
+            after = has_after[j]
+            kind = 2 * before + after
+            rx = dx / elapsed[i] - ahead[after, 0] - partner[j, before, 0]
+            ry = dy / elapsed[i] - ahead[after, 1] - partner[j, before, 1]
+            step[c] = height[kind] + fate - appear[j]
+            step[c] -= power[kind] * np.log(1.0 + (rx * rx + ry * ry) * inverse[after])
+            if step[c] > most:
+                best, most = c, step[c]
+        # The likeliest by its step first: it says which of the others are in doubt.
+        if best >= 0:
+            least = -np.inf
+            for turn in range(-1, k):
+                c = best if turn < 0 else turn
+                j = candidates[i, c]
+                if (turn >= 0 and c == best) or j < 0:
+                    continue
+                if cut[i] or cut[j]:
+                    least = max(least, step[c] - doubt)
+                    continue
+                if step[c] + unlike[j] - wide < least:
+                    continue
+                near = 0.0
+                for d in range(f):
+                    near += (shape_after[j, d] - shape_expected[i, d]) ** 2
+                near /= shape_spread[i] ** 2 * shape_tail
+                odds = unlike[j] - wide - half * np.log(1.0 + near)
+                if informative[i] < 1.0:
+                    odds = np.log(1.0 - informative[i] + informative[i] * np.exp(odds))
+                step[c] += odds
+                least = max(least, step[c] - doubt)
+        for c in range(k):
+            gain[i, c] = step[c]
 
 
 @njit(cache=True)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from cellquant.tables import Cells
+from cellquant.track.kernels import widest_gaps
 from cellquant.track.near import nearest_cells
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
@@ -121,6 +122,8 @@ def flatten(cells: Cells) -> Movie:
         here = slice(int(start[index]), int(start[index + 1]))
         found, spacing[index], density[here] = _surroundings(position[here], width * height)
         neighbours[here] = found + start[index]
+    open_angle = np.empty(len(frame))
+    widest_gaps(position, neighbours[:, :_RING], open_angle)
     x, y = position[:, 0], position[:, 1]
     margin = np.minimum.reduce([x, y, width - cells.pixel_size - x, height - cells.pixel_size - y])
     return Movie(
@@ -135,7 +138,7 @@ def flatten(cells: Cells) -> Movie:
         density=density,
         margin=margin,
         cut=table["touches_border"].to_numpy(np.bool_),
-        rim=_at_rim(position, neighbours[:, :_RING]),
+        rim=open_angle > _OPEN_ANGLE,
         frame_index=np.repeat(np.arange(len(time)), np.diff(start)),
         elapsed=np.repeat(np.append(np.diff(time), 1), np.diff(start)).astype(np.float64),
         field_of_view=(width, height),
@@ -159,17 +162,6 @@ def _surroundings(position: FloatArray, area: float) -> tuple[IntArray, float, F
         spacing = float(np.sqrt(area / n))
     reach = np.maximum(distance[:, min(k, NEAR)], spacing / 2)
     return found, spacing, np.maximum(min(k, NEAR) / (np.pi * reach**2), 1.0 / area)
-
-
-def _at_rim(position: FloatArray, neighbours: IntArray) -> BoolArray:
-    """Whether the nearest cells (N, k) leave a wide angle free."""
-    if len(position) == 0 or neighbours.shape[1] == 0:
-        return np.ones(len(position), dtype=np.bool_)
-    step = position[neighbours] - position[:, None]
-    angle = np.sort(np.arctan2(step[..., 1], step[..., 0]), axis=1)
-    gap = np.diff(angle, axis=1, append=angle[:, :1] + 2.0 * np.pi)
-    wide: BoolArray = gap.max(axis=1) > _OPEN_ANGLE
-    return wide
 
 
 def _descriptors(cells: Cells) -> FloatArray:

@@ -10,22 +10,21 @@ from cellquant.track.assign import match_with_divisions
 from cellquant.track.costs import (
     Motion,
     Paths,
-    Shapes,
     expected_steps,
     first_motion,
     fit_motion,
-    fit_shapes,
     gains,
     paths,
 )
 from cellquant.track.cues import Cue, Look, evidence, fit_cue, joined
-from cellquant.track.divisions import Divisions, fit_divisions, propose
+from cellquant.track.divisions import Divisions, fit_divisions, log_frequency, propose
 from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
 from cellquant.track.flow import CANDIDATES, all_flows
 from cellquant.track.images import PairImages
 from cellquant.track.kernels import marginals
-from cellquant.track.movie import BoolArray, FloatArray, IntArray, Links, Movie
+from cellquant.track.movie import LOG_AREA, BoolArray, FloatArray, IntArray, Links, Movie
 from cellquant.track.near import nearest_cells
+from cellquant.track.shapes import Shapes, fit_shapes, population_of
 
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
@@ -67,6 +66,7 @@ class Solution:
     motion: Motion
     shapes: Shapes
     rates: Rates
+    sizes: FloatArray
     links: Links | None = None
     divisions: Divisions | None = None
     probability: FloatArray | None = None
@@ -138,6 +138,7 @@ def solve(
                 movie,
                 state.links,
                 middle,
+                state.sizes,
                 spread=state.motion.spread * np.sqrt(movie.elapsed),
                 width=float(state.motion.scale[0]),
                 tail=float(state.motion.tail[0]),
@@ -165,8 +166,9 @@ def _start(movie: Movie, options: Options) -> Solution:
         carried=carried,
         known=_paths(movie, None, flow, carried, options),
         motion=first_motion(movie),
-        shapes=fit_shapes(movie, None),
+        shapes=fit_shapes(movie, None, population_of(movie)),
         rates=fit_rates(movie, None, leaving, entering),
+        sizes=log_frequency(movie.shape[:, LOG_AREA]),
     )
 
 
@@ -193,7 +195,7 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
     state.known = _paths(movie, links, state.flow, state.carried, options)
     state.motion = fit_motion(movie, links, state.known, state.motion)
     if options.use_shape:
-        state.shapes = fit_shapes(movie, links)
+        state.shapes = fit_shapes(movie, links, state.shapes.population)
     state.rates = fit_rates(movie, links, state.leaving, state.entering)
     if options.divisions and turn == _DIVISION_PASS:
         state.rates = suppose_divisions(state.rates)
@@ -260,7 +262,15 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
     assert gain is not None
     n = movie.n_cells
     probability = state.probability = np.empty(candidates.shape)
-    marginals(gain, candidates, movie.start, _SWEEPS, np.log(_UNLIKELY) - _MARGIN, probability)
+    marginals(
+        gain,
+        candidates,
+        movie.start,
+        _SWEEPS,
+        float(np.log(_UNLIKELY)) - _MARGIN,
+        -float(np.log(_UNLIKELY)),
+        probability,
+    )
     row, slot = np.nonzero(probability > _UNLIKELY)
     column, sure = candidates[row, slot], probability[row, slot]
     families, odds = np.empty((0, 3), dtype=np.int64), np.empty(0)
