@@ -1,6 +1,7 @@
 """Linking: closed forms, invariances, broken input."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from cellquant.track.divisions import log_frequency
 from cellquant.track.evaluate import evaluate
 from cellquant.track.kernels import marginals
 from cellquant.track.movie import flatten
+from cellquant.track.near import nearest_cells
 from cellquant.track.solve import Options, solve
 
 
@@ -307,10 +309,53 @@ def test_cells_at_the_rim_of_a_layer_are_known() -> None:
     assert rim[~inside].all()
 
 
-def test_marginals_of_one_pair_are_its_odds() -> None:
-    out = np.empty((1, 1))
-    marginals(np.array([[1.5]]), np.array([[0]]), 1, 6, out)
-    assert out[0, 0] == pytest.approx(1.0 / (1.0 + np.exp(-1.5)))
+def test_marginals_are_those_of_all_matchings() -> None:
+    """Exact on a chain of candidates, by counting every way to link its cells."""
+    nothing = -np.inf
+    gain = np.array([[1.5, -0.5], [2.0, nothing], [0.3, 1.0]] + [[nothing, nothing]] * 3)
+    candidates = np.array([[3, 4], [4, -1], [5, 4]] + [[-1, -1]] * 3)
+    out = np.empty(gain.shape)
+    marginals(gain, candidates, np.array([0, 3, 6]), 8, -15.0, 9.0, out)
+    weight, total = np.zeros((3, 2)), 0.0
+    for slots in product((0, 1, -1), repeat=3):
+        chosen = [(row, slot) for row, slot in enumerate(slots) if slot >= 0]
+        targets = [candidates[key] for key in chosen]
+        if -1 in targets or len(set(targets)) < len(targets):
+            continue
+        worth = np.exp(sum(gain[key] for key in chosen))
+        total += worth
+        for key in chosen:
+            weight[key] += worth
+    assert out[:3] == pytest.approx(weight / total, abs=1e-6)
+    assert (out[3:] == 0.0).all()
+
+
+def test_a_sure_link_is_not_propagated_and_keeps_its_odds() -> None:
+    """The short cut for links beyond doubt agrees with propagation, and drops their rivals."""
+    gain = np.array([[14.0, -1.0], [-2.0, 3.0]] + [[-np.inf] * 2] * 2)
+    candidates = np.array([[2, 3], [2, 3], [-1, -1], [-1, -1]])
+    short, full = np.empty(gain.shape), np.empty(gain.shape)
+    marginals(gain, candidates, np.array([0, 2, 4]), 8, -15.0, 9.0, short)
+    marginals(gain, candidates, np.array([0, 2, 4]), 8, -15.0, np.inf, full)
+    assert short[0, 1] == short[1, 0] == 0.0
+    assert short == pytest.approx(full, abs=1e-4)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    arrays(
+        np.float64, st.tuples(st.integers(0, 40), st.just(2)), elements=st.floats(0, 9, width=16)
+    ),
+    arrays(np.float64, (7, 2), elements=st.floats(-20, 30, width=16)),
+    st.integers(1, 12),
+)
+def test_nearest_cells_are_the_nearest(there: np.ndarray, points: np.ndarray, k: int) -> None:
+    found, square = nearest_cells(points, there, k)
+    distance = ((points[:, None] - there[None]) ** 2).sum(axis=2)
+    order = np.argsort(distance, axis=1, kind="stable")[:, :k]
+    assert np.array_equal(found[:, : order.shape[1]], order)
+    assert np.array_equal(square[:, : order.shape[1]], np.take_along_axis(distance, order, axis=1))
+    assert (found[:, order.shape[1] :] == -1).all()
 
 
 @pytest.mark.slow
