@@ -1,6 +1,7 @@
 """Label masks: checked, measured, and made from images."""
 
-from cellquant.segment.contours import NEIGHBOUR_GAP, Outlines, measure_outlines
+from cellquant.segment.contours import Outlines, measure_outlines
+from cellquant.segment.crackpaths import NEIGHBOUR_GAP
 from cellquant.segment.labels import FAULTS, repair
 from cellquant.segment.measure import FrameCells, measure_cells, measure_frame
 
