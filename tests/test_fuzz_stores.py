@@ -23,6 +23,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cellquant.cli.text import run_lines
 from cellquant.config import (
     TEMPLATES,
     ExperimentConfig,
@@ -208,6 +209,8 @@ def use(path: Path) -> None:
     assert len(run.time) == run.n_frames
     run.to_tracks(columns=["x", "y", "track_id", "time"])
     assert run.modes.shape[0] == run.polarity.shape[0] == run.n_frames
+    assert run_lines(run)
+    assert run.failure is None or isinstance(run.failure, dict)
 
 
 def check_store(files: dict[str, bytes]) -> None:
@@ -218,6 +221,24 @@ def check_store(files: dict[str, bytes]) -> None:
             (path / name).write_bytes(content)
         only_input_errors(lambda: use(path))
         only_input_errors(lambda: read_arrays(path / "checkpoint.npz"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("save_every", ""), ("save_every", None), ("save_every", 0), ("dt", "x"), ("dt", None),
+     ("duration", -1), ("points", True), ("transient", 10**400), ("contact", 3)],
+)  # fmt: skip
+def test_a_run_with_an_impossible_setting_is_refused(
+    tmp_path: Path, name: str, value: object
+) -> None:
+    for file, content in run_files().items():
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_bytes(content)
+    described = json.loads((tmp_path / "zarr.json").read_text())
+    described["attributes"]["settings"][name] = value
+    (tmp_path / "zarr.json").write_text(json.dumps(described))
+    with pytest.raises(InputError, match="is not a readable run"):
+        open_run(tmp_path)
 
 
 @settings(max_examples=QUICK, **COMMON)

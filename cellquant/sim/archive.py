@@ -24,7 +24,7 @@ from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
 Floats = NDArray[np.float64]
 CHECKPOINT = "checkpoint.npz"
 _SHAPE_COLUMNS = ("perimeter", "shape_index", "aspect_ratio", "orientation")
-_SETTINGS = ("contact", "points", "integrator", "dt", "save_every", "transient", "duration")
+_LARGEST = 1e300  # number in the description of a run
 CHUNK = 262_144  # numbers of a chunk: what one write of a growing run touches
 
 
@@ -75,16 +75,36 @@ def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> Any:
     try:
         group = zarr.open_group(zarr.storage.LocalStore(path, read_only=mode == "r"), mode=mode)
         attributes: dict[str, Any] = dict(group.attrs)
-        Scene.from_dict(dict(attributes["scene"]))
-        missing = set(_SETTINGS) - set(attributes["settings"])
-        if missing or "status" not in attributes:
-            raise ValueError("its settings are not complete")
+        _check_description(attributes)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path} is not a readable run ({_first_line(error)}); "
             "make one with 'cellquant simulate -o RUN.zarr'."
         ) from error
     return group
+
+
+def _check_description(attributes: dict[str, Any]) -> None:
+    """Raise `ValueError`, `KeyError` or `TypeError` where attributes are not those of a run."""
+    Scene.from_dict(dict(attributes["scene"]))
+    if not isinstance(attributes["status"], str):
+        raise ValueError("its status is not a word")
+    if attributes["failure"] is not None:
+        dict(attributes["failure"])
+    settings = dict(attributes["settings"])
+    for name in ("contact", "integrator"):
+        if not isinstance(settings[name], str):
+            raise ValueError(f"its {name} is {settings[name]!r}, not a name")
+    positive = ("save_every", "dt", "tolerance", "points")
+    numbers = {name: settings[name] for name in (*positive, "transient", "duration")}
+    for name in ("points", "dt" if numbers["dt"] is None else "tolerance"):
+        if numbers[name] is None:
+            del numbers[name]
+    for name, value in (*numbers.items(), *dict(attributes.get("work", {})).items()):
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"its {name} is {value!r}, not a number")
+        if not 0 <= value <= _LARGEST or (name in positive and value == 0):
+            raise ValueError(f"its {name} is {value!r}")
 
 
 def _first_line(error: BaseException) -> str:
