@@ -3,8 +3,13 @@
 Between the simulation and what the pipeline reports lie four steps, each of which may add an error.
 They are told apart by observing the same layer after each of them, so that most of the sampling
 noise is common to all: the run itself; the run at the frame interval of the camera; its true tracks
-in the field of view; the cells measured on the masks, with their true identities; and the tracks
-that were found.
+as far as the camera sees them; the cells measured on the masks, with their true identities; and the
+tracks that were found.
+
+A field of view loses the cells that leave it, the fast ones first, and with them motion. So the
+camera sees one period of the layer with a guard strip around it, and the cells that start in that
+period are followed: every cell of the layer once, chosen before anything is known of its motion,
+and lost only when it crosses the strip.
 
 Movies are smoothed by default, over five points. That changes what is measured, truth included, so
 it is held apart: the tracks that were found and the run at the frame interval of the camera are
@@ -31,13 +36,13 @@ if TYPE_CHECKING:
 LENGTH = 23.9  # um in one L0: a disc of 450 um^2
 TIME = 2.0  # min in one t0
 PIXEL = LENGTH / 30.0  # um: cells of 15 pixels radius
-MARGIN = 1.0  # L0 by which the camera sees more than the periodic layer: each cell whole once
+GUARD = 4.0  # L0 that the camera sees of the periodic layer beyond each edge of one period
 FINER = 5  # frames of the run in one frame interval of the camera
 
 STAGES = {
     "truth": "the run itself",
     "sampled": "the run at the frame interval of the camera",
-    "field": "its true tracks in the field of view",
+    "field": "its true tracks as far as the camera sees them",
     "pixels": "cells measured on the masks, true identities",
     "found": "tracks found",
 }
@@ -49,7 +54,7 @@ SMOOTHING = 5  # points, the default for movies
 # What the step from one stage to the next adds.
 STEPS = {
     "sampled": "frame interval",
-    "field": "field of view",
+    "field": "finite window",
     "pixels": "pixels",
     "found": "linking",
 }
@@ -123,7 +128,7 @@ class Loop:
     observed
         Observables of every stage, by its name in `STAGES` and `SMOOTHED`.
     tracks
-        The tracks found.
+        The tracks found of the cells that are followed.
     record
         How they were found.
     table
@@ -149,8 +154,9 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
         The scene and its run; the camera takes a frame every ``save_every``, and the run is saved
         five times as often.
     folder
-        Output folder: ``run.zarr``, ``masks.tif`` with ``masks_truth``, a folder of observables
-        for each of `STAGES` and `SMOOTHED`, and ``closed_loop.json``.
+        Output folder: ``run.zarr``, ``masks.tif`` with ``masks_truth``, ``tracked`` with all cells
+        and tracks of the masks, a folder of observables for each of `STAGES` and `SMOOTHED` (that
+        of ``found`` holds the tracks that are followed), and ``closed_loop.json``.
     step
         Gives a progress callback for each stage.
     """
@@ -168,24 +174,28 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
             pixel_size=PIXEL,
             length=LENGTH,
             time=TIME,
-            margin=MARGIN,
+            margin=2.0 * GUARD,
             step=FINER,
             progress=progress,
         )
     masks = read_labels(folder / "masks.tif")
-    cells, tracks, record = track_movie(masks, folder / "found", step=step)
+    cells, tracks, record = track_movie(masks, folder / "tracked", step=step)
     truth = run.to_tracks(columns=columns_read(WANTED))
     sampled = _every(truth, FINER)
-    identified = _with_identities(cells, rendering.tracks)
+    seen = _followed(rendering.tracks, run)
+    identified = _followed(_with_identities(cells, rendering.tracks), run)
+    found = _followed(tracks, run)
+    (folder / "found").mkdir(parents=True, exist_ok=True)
+    found.write(folder / "found" / "tracks.parquet")
     observed = {}
     for name, origin, source, points in (
         ("truth", "../run.zarr", truth, 1),
         ("sampled", "../run.zarr", sampled, 1),
-        ("field", "../masks_truth", rendering.tracks, 1),
-        ("pixels", "../found/cells.parquet", identified, 1),
-        ("found", "../masks.tif", tracks, 1),
+        ("field", "../masks_truth", seen, 1),
+        ("pixels", "../tracked/cells.parquet", identified, 1),
+        ("found", "../masks.tif", found, 1),
         ("truth_smoothed", "../run.zarr", sampled, SMOOTHING),
-        ("found_smoothed", "../found/tracks.parquet", tracks, SMOOTHING),
+        ("found_smoothed", "../found/tracks.parquet", found, SMOOTHING),
     ):
         settings = {
             "source": origin,
@@ -205,11 +215,11 @@ def close_loop(scene: "SceneConfig", folder: Path, *, step: Step = silent) -> Lo
         "um per L0": LENGTH,
         "min per t0": TIME,
         "um per pixel": PIXEL,
-        "margin of the field, L0": MARGIN,
+        "guard strip around the layer, L0": GUARD,
         "frames of the run per frame of the camera": FINER,
         "points of the smoothing, where smoothed": SMOOTHING,
     }
-    return Loop(run, observed, tracks, record, table, made_with)
+    return Loop(run, observed, found, record, table, made_with)
 
 
 def _every(tracks: "Tracks", step: int) -> "Tracks":
@@ -217,6 +227,20 @@ def _every(tracks: "Tracks", step: int) -> "Tracks":
     kept = tracks.table[tracks.table["frame"] % step == 0]
     table = kept.assign(frame=kept["frame"] // step).reset_index(drop=True)
     return replace(tracks, table=table, frame_interval=tracks.frame_interval * step)
+
+
+def _followed(tracks: "Tracks", run: "Run") -> "Tracks":
+    """The tracks, in um, that start inside the guard strip: each cell of the layer once."""
+    import numpy as np
+
+    side = np.array(run.box) * LENGTH
+    strip = GUARD * LENGTH
+    first = tracks.table[tracks.table["frame"] == 0]
+    place = first[["x", "y"]].to_numpy()
+    inside = ((place >= strip) & (place < strip + side)).all(axis=1)
+    kept = tracks.table["track_id"].isin(first["track_id"][inside])
+    table = tracks.table[kept].reset_index(drop=True)
+    return replace(tracks, table=table, area=float(side.prod()))
 
 
 def _with_identities(cells: "Cells", truth: "Tracks") -> "Tracks":
@@ -276,11 +300,12 @@ def closed_loop_table(stages: "Mapping[str, Mapping[str, tuple[float, float]]]")
     -------
     pandas.DataFrame
         quantity, unit, truth, truth_std_error, measured, measured_std_error, error
-        (measured/truth - 1), then for each step its share: this stage over the one before,
-        minus 1. The speed is defined by the frame interval: its truth is the sampled run's.
-        Then truth and measurement with both smoothed, ``smoothing_adds``: what smoothing changes
-        in the tracks found, not part of the error, and ``error_smoothed``: the error with both
-        smoothed. NaN where a quantity could not be measured.
+        (measured/truth - 1), error_in_std_errors (of the measured value), then for each step its
+        share: this stage over the one before, minus 1. The speed is defined by the frame
+        interval: its truth is the sampled run's. Then truth and measurement with both smoothed,
+        ``smoothing_adds``: what smoothing changes in the tracks found, not part of the error, and
+        ``error_smoothed``: the error with both smoothed. NaN where a quantity could not be
+        measured.
     """
     import pandas as pd
 
@@ -300,6 +325,7 @@ def closed_loop_table(stages: "Mapping[str, Mapping[str, tuple[float, float]]]")
             "measured": measured,
             "measured_std_error": measured_error,
             "error": measured / values["truth"] - 1.0,
+            "error_in_std_errors": (measured - values["truth"]) / measured_error,
         }
         for before, after in pairwise(names):
             row[f"from_{STEPS[after].replace(' ', '_')}"] = values[after] / values[before] - 1.0

@@ -7,7 +7,7 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cellquant.closed_loop import LENGTH, PIXEL, TIME, Loop, close_loop
+from cellquant.closed_loop import GUARD, LENGTH, PIXEL, TIME, Loop, close_loop
 from cellquant.config import SceneConfig
 from cellquant.pipeline import Step, observe_into, silent, track_movie
 from cellquant.storage import RunRecord, atomic_path, check_output, write_json
@@ -142,7 +142,7 @@ def _headlines(loop: Loop) -> "tuple[Headline, ...]":
 
 _SMOOTHED = ("mean speed", "MSD at the relaxation time", "relaxation time")
 _UNITS = {
-    "1": "",
+    "1": "none",
     "L0": "L_{0}",
     "L0^2": "L_{0}^{2}",
     "t0": "t_{0}",
@@ -164,11 +164,11 @@ def _per_cent(share: float) -> str:
 
 _STEP_TEXTS = (
     "Frame interval: the camera sees one state in five that the run saved; what happens in between "
-    "is not seen.",
-    "Field of view: cells that the edge cuts are left out. The camera sees one cell diameter more "
-    "than the periodic layer, so that nearly every cell is whole in one place. Cells that move far "
-    "leave the field more often than others, and tracks that are cut short are left out: a window "
-    "shows a sample of the motion, however well it is measured.",
+    "is not seen. σ^{2} and ξ belong to the frame next to the relaxation time.",
+    "Finite window: a field of view loses the cells that leave it, the fast ones first, and motion "
+    f"with them. So the camera sees the layer, which is periodic, and a strip of {GUARD:g} cell "
+    "diameters of its continuation around it; the cells that start inside the strip are followed, "
+    "each cell of the layer once, and lost only when they cross the whole strip.",
     "Pixels: cells are drawn on a grid, and where two overlap each pixel goes to one of them.",
     "Linking: cells that were followed wrongly from frame to frame.",
 )
@@ -189,7 +189,9 @@ def _error_table(loop: Loop) -> "Table":
                     format_value(row["truth"], row["truth_std_error"]),
                     format_value(row["measured"], row["measured_std_error"]),
                     _UNITS[row["unit"]],
-                    *(_per_cent(share) for share in shares),
+                    _per_cent(shares[0]),
+                    format_value(round(row["error_in_std_errors"], 2)),
+                    *(_per_cent(share) for share in shares[1:]),
                 ),
                 "none" if isnan(shares[0]) else "",
             )
@@ -198,18 +200,21 @@ def _error_table(loop: Loop) -> "Table":
         name="closed-loop",
         caption="Truth and measurement of the same layer, value ± standard error, in units of the "
         "model (L_{0}: diameter of a mean cell; t_{0}: time in which contact forces act; d: mean "
-        "diameter as measured). Both show the same cells, so their difference is known better than "
-        "either. Nothing is smoothed. The four columns on the right are the parts of the error, "
-        "step by step as named above. From layer/closed_loop.json.",
+        "diameter as measured). Nothing is smoothed. A standard error says how far another layer "
+        "of this size would be off; both sides show the same cells, so that they are closer to "
+        "each other. In the column after the error, measured minus truth is in standard errors of "
+        "the measured value. The four columns on the right are the parts of the error, step by "
+        "step as named above. From layer/closed_loop.json.",
         columns=(
             "Quantity",
             "Truth",
             "Measured",
             "Unit",
             "Error",
+            "Error in standard errors",
             *(name.replace("_", " ") for name in steps),
         ),
-        classes=("", "number", "number", "", "number", *("number" for _ in steps)),
+        classes=("", "number", "number", "", "number", "number", *("number" for _ in steps)),
         rows=tuple(rows),
         data=loop.table,
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from cellquant import __version__
 from cellquant.compare.groups import Group, read_groups
 from cellquant.compare.matching import Matched, matched_scalars, product_of
-from cellquant.compare.results import Scalar
+from cellquant.compare.results import Scalar, plain_unit
 from cellquant.compare.study_tables import Study, read_study
 from cellquant.compare.units import STERIC_AREA
 from cellquant.errors import InputError
@@ -294,7 +294,7 @@ def _group_dict(group: Group, area: tuple[float, float]) -> dict[str, Any]:
                 "value": _finite(s.value),
                 "std_error": _finite(s.std_error),
                 "censored_at": _finite(s.censored_at),
-                "unit": s.unit,
+                "unit": plain_unit(s.unit),
                 "sample": s.n,
                 "rule": s.rule,
             }

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from cellquant.compare.groups import Group
+from cellquant.compare.page import format_value
 from cellquant.compare.results import Scalar, look_up
 from cellquant.compare.units import packing_fraction_of
 
@@ -86,7 +87,7 @@ def matched_scalars(group: Group, *, area: tuple[float, float]) -> dict[str, Mat
 def _unknown(scalar: Scalar) -> str:
     if math.isfinite(scalar.value):
         return ""
-    return f"only a bound is known, > {scalar.censored_at:g} {scalar.unit}"
+    return f"only a bound is known, > {format_value(scalar.censored_at)} {scalar.unit}"
 
 
 def _packing(group: Group, scalars: Mapping[str, Scalar], area: tuple[float, float]) -> Matched:

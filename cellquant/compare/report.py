@@ -26,6 +26,7 @@ from cellquant.compare.results import (
     Result,
     Scalar,
     look_up,
+    plain_unit,
     pretty_unit,
     read_result,
     read_scalars,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from cellquant.tables import Cells, Tracks
 
 _LIBRARIES = ("numpy", "scipy", "numba", "pandas", "opencv-python-headless", "matplotlib")
+PURE = "none"  # the unit of a pure number, where a table has a column of units
 _HEADLINES = ("density.mean", "shape_index.mean", "tau_alpha.value", "speed.mean")
 # What the counts of faults mean, in words; others are listed under their own name.
 _FAULTS = {
@@ -229,7 +231,7 @@ def scalar_table(scalars: Sequence[Scalar]) -> Table:
         columns=("Quantity", "Value", "Unit", "Sample", "How it was obtained"),
         classes=("", "number", "", "", "note"),
         rows=tuple(
-            Row((s.label, scalar_text(s), s.unit, s.n, _censored_rule(s))) for s in scalars
+            Row((s.label, scalar_text(s), s.unit or PURE, s.n, _censored_rule(s))) for s in scalars
         ),
         data=pd.DataFrame(
             {
@@ -237,8 +239,7 @@ def scalar_table(scalars: Sequence[Scalar]) -> Table:
                 "value": [s.value for s in scalars],
                 "std_error": [s.std_error for s in scalars],
                 "censored_at": [s.censored_at for s in scalars],
-                "unit": [s.unit.replace("_{", "").replace("{", "").replace("}", "")
-                         for s in scalars],
+                "unit": [plain_unit(s.unit) for s in scalars],
                 "sample": [s.n for s in scalars],
             }
         ),

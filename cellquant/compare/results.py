@@ -278,6 +278,11 @@ def pretty_unit(unit: str) -> str:
     return {"um": "µm", "L0": "L_{0}", "t0": "t_{0}"}.get(unit, unit)
 
 
+def plain_unit(unit: str) -> str:
+    """Spelling of a unit in files: without markup, ``1`` for a pure number."""
+    return unit.replace("_{", "").replace("{", "").replace("}", "") or "1"
+
+
 def _raised(name: str, power: int) -> str:
     return name if power == 1 else f"{name}^{{{power}}}"
 
