@@ -231,16 +231,14 @@ def _every(tracks: "Tracks", step: int) -> "Tracks":
 
 def _followed(tracks: "Tracks", run: "Run") -> "Tracks":
     """The tracks, in um, that start inside the guard strip: each cell of the layer once."""
-    import numpy as np
-
-    side = np.array(run.box) * LENGTH
     strip = GUARD * LENGTH
+    width, height = (edge * LENGTH for edge in run.box)
     first = tracks.table[tracks.table["frame"] == 0]
-    place = first[["x", "y"]].to_numpy()
-    inside = ((place >= strip) & (place < strip + side)).all(axis=1)
+    inside = first["x"].between(strip, strip + width, inclusive="left")
+    inside &= first["y"].between(strip, strip + height, inclusive="left")
     kept = tracks.table["track_id"].isin(first["track_id"][inside])
     table = tracks.table[kept].reset_index(drop=True)
-    return replace(tracks, table=table, area=float(side.prod()))
+    return replace(tracks, table=table, area=width * height)
 
 
 def _with_identities(cells: "Cells", truth: "Tracks") -> "Tracks":

@@ -1,5 +1,6 @@
 """Commands that bring things together: demo, compare, convert-units, config."""
 
+from collections import Counter
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -60,6 +61,7 @@ def compare(
 ) -> None:
     """Put experiments and simulations side by side: a report, and comparison.json beside it."""
     from cellquant.compare import compare as compare_results
+    from cellquant.compare.comparison import AGREE, DIFFER, NOT_COMPARABLE
     from cellquant.compare.units import STERIC_AREA
     from cellquant.storage import check_output
 
@@ -72,10 +74,8 @@ def compare(
         comparison.to_json(output.with_name("comparison.json"))
     for first, second in comparison.pairs():
         verdicts = comparison.verdicts(first, second)
-        counts = {v.verdict: 0 for v in verdicts}
-        for verdict in verdicts:
-            counts[verdict.verdict] += 1
-        found = ", ".join(f"{count} {word}" for word, count in counts.items())
+        counts = Counter(v.verdict for v in verdicts)
+        found = ", ".join(f"{counts[word]} {word}" for word in (AGREE, DIFFER, NOT_COMPARABLE))
         say(f"{first.name} and {second.name}: {found}")
     for found_fit in comparison.fits:
         say(f"{found_fit.target}: {found_fit.ranking.statement()}")

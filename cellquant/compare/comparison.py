@@ -231,7 +231,8 @@ def judge(first: Matched, second: Matched) -> Verdict:
     """Agreement within two combined standard errors, where the two may be compared at all."""
     difference = second.value - first.value
     error = math.hypot(first.std_error, second.std_error)
-    reason = first.reason or second.reason
+    unknown = [side.reason for side in (first, second) if not math.isfinite(side.value)]
+    reason = next(filter(None, (*unknown, first.reason, second.reason)), "")
     if abs(math.log(first.interval / second.interval)) > math.log(MAX_INTERVAL_RATIO):
         reason = reason or (
             f"it depends on the frame interval, which is {first.interval:.2g} τ_{{α}} on one side "

@@ -41,6 +41,7 @@ from cellquant.compare.page import (
     format_value,
 )
 from cellquant.compare.report import command_lines, methods_section
+from cellquant.compare.results import look_up
 from cellquant.compare.study_figures import (
     boxes_figure,
     crowding_figure,
@@ -126,10 +127,16 @@ def _lede(movies: Sequence[Group], models: Sequence[Group]) -> str:
     if models:
         seeds = sum(group.n for group in models)
         parts.append(f"{counted(len(models), 'simulated scene')} ({counted(seeds, 'run')})")
-    return (
+    text = (
         f"{' and '.join(parts)}, measured by the same code. Values agree when they differ by no "
         f"more than {LEVEL:g} combined standard errors; what must not be compared is said."
     )
+    if any(group.scene for group in models):
+        text += (
+            " Scenes are named by the parameters of the model: packing fraction φ, self-propulsion "
+            "speed v₀ and line tension of the cell edge η, in units of the model."
+        )
+    return text
 
 
 def _closest_first(comparison: Comparison, pairs: Pairs) -> list[Group]:
@@ -219,11 +226,16 @@ def _methods(comparison: Comparison, groups: Sequence[Group]) -> Section:
 
 
 def _limits_section(pairs: Pairs, groups: Sequence[Group]) -> Section:
-    points: dict[str, str] = {}
+    reasons: dict[str, dict[str, None]] = {}
     for _, _, verdicts in pairs:
         for v in verdicts:
             if v.reason:
-                points.setdefault(v.key, f"{v.label}: {v.reason}.")
+                reasons.setdefault(v.label, {}).setdefault(v.reason)
+    points = [
+        f"{label}: {next(iter(found))}" + ("." if len(found) == 1 else "; for other pairs see the "
+                                           "verdicts.")
+        for label, found in reasons.items()
+    ]  # fmt: skip
     single = [g.name for g in groups if g.n == 1]
     text = []
     if single:
@@ -241,4 +253,16 @@ def _limits_section(pairs: Pairs, groups: Sequence[Group]) -> Section:
         )
     if not points:
         text.append("All numbers that both sides have were compared.")
-    return Section("limits", "What is not comparable", tuple(text), tuple(points.values()))
+    smoothed = {
+        look_up(result.summary, "processing.smoothing_points")
+        for group in groups
+        for result in group.members
+    } - {None}
+    if len(smoothed) > 1:
+        text.append(
+            "Not all trajectories were smoothed alike (see What is compared). Smoothing takes away "
+            "motion between frames: with ten frames in a relaxation time, five points lower the "
+            "MSD at that time by about 4 % and raise τ_{α} by about 2 %, at shorter times more. "
+            "Observe both sides with the same smoothing where that matters."
+        )
+    return Section("limits", "What is not comparable", tuple(text), tuple(points))

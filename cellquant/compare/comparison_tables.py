@@ -10,6 +10,7 @@ from cellquant.compare.comparison import (
     LEVEL,
     NOT_COMPARABLE,
     Comparison,
+    UnitMapping,
     Verdict,
     unit_mapping,
 )
@@ -17,12 +18,21 @@ from cellquant.compare.groups import Group
 from cellquant.compare.matching import Matched, matched_scalars
 from cellquant.compare.page import Row, Section, Table, format_value
 from cellquant.compare.report import scalar_text
-from cellquant.compare.results import Scalar, look_up, pretty_unit
+from cellquant.compare.results import (
+    Scalar,
+    look_up,
+    meanings,
+    plain_unit,
+    pretty_unit,
+    scale_of,
+    unit_text,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
 MAX_TABLES = 6
+NBSP = "\N{NO-BREAK SPACE}"
 Pairs = Sequence[tuple[Group, Group, Sequence[Verdict]]]
 
 
@@ -43,16 +53,9 @@ def verdict_section(pairs: Pairs) -> Section:
         "the same; of twenty numbers that are equal, about one will be called different by chance."
     ]
     tables = []
-    shown = list(pairs)
-    if len(pairs) > 3:
+    shown = closest_pairs(pairs)
+    if len(shown) < len(pairs):
         tables.append(_overview_table(pairs))
-        # Of each group on the left, the partner with which most numbers agree.
-        best: dict[str, tuple[Group, Group, Sequence[Verdict]]] = {}
-        for pair in pairs:
-            kept = best.get(pair[0].name)
-            if kept is None or share(pair[2]) > share(kept[2]):
-                best[pair[0].name] = pair
-        shown = list(best.values())[:MAX_TABLES]
         text.append(
             f"Of {len(pairs)} pairs, the tables below show for each experiment the scene with "
             "which most numbers agree; all pairs are in comparison.json."
@@ -62,6 +65,18 @@ def verdict_section(pairs: Pairs) -> Section:
         for index, (first, second, verdicts) in enumerate(shown)
     ]
     return Section("verdicts", "What agrees, what differs", tuple(text), tables=tuple(tables))
+
+
+def closest_pairs(pairs: Pairs) -> Pairs:
+    """For each group on the left the partner with which most numbers agree; all of up to three."""
+    if len(pairs) <= 3:
+        return pairs
+    best: dict[str, tuple[Group, Group, Sequence[Verdict]]] = {}
+    for pair in pairs:
+        kept = best.get(pair[0].name)
+        if kept is None or share(pair[2]) > share(kept[2]):
+            best[pair[0].name] = pair
+    return list(best.values())[:MAX_TABLES]
 
 
 def share(verdicts: Sequence[Verdict]) -> float:
@@ -131,7 +146,7 @@ def _with_unit(matched: Matched, scalar: Scalar | None) -> str:
     value, known = format_value(matched.value, matched.std_error), math.isfinite(matched.value)
     if not known and scalar is not None and math.isfinite(scalar.censored_at):
         value, known = scalar_text(scalar), True
-    return f"{value} {matched.unit}" if matched.unit and known else value
+    return f"{value}{NBSP}{matched.unit}" if matched.unit and known else value
 
 
 def sides_section(groups: Sequence[Group]) -> Section:
@@ -145,19 +160,17 @@ def sides_section(groups: Sequence[Group]) -> Section:
         for key in ("wave_number.mean_diameter", "tau_alpha.value"):
             scalar = scalars.get(key)
             text = "–" if scalar is None else scalar_text(scalar)
-            shown.append(text if text == "–" or scalar is None else f"{text} {scalar.unit}")
+            shown.append(text if text == "–" or scalar is None else f"{text}{NBSP}{scalar.unit}")
         step = look_up(summaries[0], "speed.dt")
         points = look_up(summaries[0], "processing.smoothing_points")
         rows.append(
             Row(
                 (
                     group.name,
-                    counted(group.n, "run" if group.simulated else "trial").replace(
-                        " ", "\N{NO-BREAK SPACE}"
-                    ),
+                    counted(group.n, "run" if group.simulated else "trial").replace(" ", NBSP),
                     str(len(group.members)),
                     _range([s.get("n_frames") for s in summaries]),
-                    "–" if step is None else f"{step:g} {pretty_unit(units.time)}",
+                    "–" if step is None else f"{step:g}{NBSP}{pretty_unit(units.time)}",
                     _range([s.get("n_cells_mean") for s in summaries]),
                     str(sum(int(s.get("n_tracks") or 0) for s in summaries)),
                     *shown,
@@ -183,8 +196,21 @@ def sides_section(groups: Sequence[Group]) -> Section:
                 ("", *("number",) * 9),
                 tuple(rows),
             ),
+            _quantities_table(groups),
         ),
     )  # fmt: skip
+
+
+def _quantities_table(groups: Sequence[Group]) -> Table:
+    """What each number is."""
+    known = {key for group in groups for key in group.scalars()}
+    return Table(
+        "quantities",
+        "What is measured on both sides, and how.",
+        ("Quantity", "How it is obtained"),
+        ("", ""),
+        tuple(Row(pair) for key, pair in meanings().items() if key in known),
+    )
 
 
 def _range(values: Sequence[float | None]) -> str:
@@ -214,30 +240,151 @@ def _verdict_data(verdicts: Sequence[Verdict]) -> "pd.DataFrame":
 
 
 def units_section(comparison: Comparison, pairs: Pairs) -> Section | None:
+    """What L0 and t0 are in the movie, numbers of both sides in both systems, and the crowding."""
+    chosen = closest_pairs(pairs)
+    mapped = [(a, b, m) for a, b, _ in chosen if (m := unit_mapping(a, b)) is not None]
+    tables = []
+    if mapped:
+        tables.append(_scales_table(comparison, mapped))
+        for index, (movie, model, mapping) in enumerate(mapped, start=1):
+            table = _both_systems_table(index, movie, model, mapping)
+            if table.rows:
+                tables.append(table)
+    packing = _packing_rows(comparison)
+    area, error = comparison.area
+    if packing:
+        tables.append(
+            Table("packing", f"Effective packing fraction: density × steric cell area, "
+                  f"{area:.0f} ± {error:.0f} µm^{{2}}.",
+                  ("Experiment", "Density (1/mm^{2})", "φ, effective"),
+                  ("", "number", "number"), packing)
+        )  # fmt: skip
+    if not tables:
+        return None
+    text = []
+    if mapped:
+        text.append(
+            "The model has no micrometres and no minutes. These are the values that its units take "
+            "if the two sides are the same material. They are a choice, and so nothing that was "
+            "used for it counts as agreement."
+        )
+    if packing:
+        text.append(
+            "No one-to-one map leads from a density to a packing fraction, because real cells "
+            "spread and overlap. The effective φ orders the two sides; its error is mostly that "
+            "of the cell area, which is shared by all experiments."
+        )
+    return Section("units", "Units of the two sides", text=tuple(text), tables=tuple(tables))
+
+
+Mapped = Sequence[tuple[Group, Group, UnitMapping]]
+
+
+def _scales_table(comparison: Comparison, mapped: Mapped) -> Table:
+    """L0, t0 and v0 by pair, and as given."""
     rows = []
-    for first, second, _ in pairs[:MAX_TABLES]:
-        mapping = unit_mapping(first, second)
-        if mapping is None:
-            continue
-        length = pretty_unit(first.members[0].units.length)
-        time = pretty_unit(first.members[0].units.time)
-        cells = [f"{first.name} and {second.name}"]
-        cells.append(f"{format_value(mapping.length, mapping.length_error)} {length}")
+    for movie, model, mapping in mapped:
+        length, time = (pretty_unit(u) for u in _unit_names(movie))
+        cells = [f"{movie.name} and {model.name}"]
+        cells.append(f"{format_value(mapping.length, mapping.length_error)}{NBSP}{length}")
         if math.isfinite(mapping.time):
-            cells.append(f"{format_value(mapping.time, mapping.time_error)} {time}")
-            speed = mapping.length / mapping.time
-            relative = math.hypot(
-                mapping.length_error / mapping.length, mapping.time_error / mapping.time
-            )
-            active = second.scene.get("v0")
-            shown = (
-                "" if active is None else format_value(active * speed, active * speed * relative)
-            )
-            cells.append(f"{shown} {length}/{time}" if shown else "")
+            cells.append(f"{format_value(mapping.time, mapping.time_error)}{NBSP}{time}")
+            factor, relative = _scale(mapping, (1, -1))
+            active = model.scene.get("v0")
+            cells.append(
+                "–" if active is None else
+                f"{format_value(active * factor, active * factor * relative)}{NBSP}{length}/{time}"
+            )  # fmt: skip
         else:
-            cells += ["", ""]
+            cells += ["–", "–"]
         rows.append(Row(tuple(cells)))
-    packing = [
+    caption = "L_{0} so that the mean diameters coincide, t_{0} so that the relaxation times do."
+    given = comparison.settings.get("L0"), comparison.settings.get("t0")
+    if all(given):
+        texts = [format_value(*value) for value in given if value]
+        rows.append(
+            Row(("as given for the fit", f"{texts[0]}{NBSP}µm", f"{texts[1]}{NBSP}min", "–"))
+        )
+        caption += " The last row holds what was given for the fit."
+    return Table("units", caption, ("Pair", "L_{0}", "t_{0}", "v₀ of the scene"),
+                 ("", "number", "number", "number"), tuple(rows))  # fmt: skip
+
+
+def _unit_names(group: Group) -> tuple[str, str]:
+    units = group.members[0].units
+    return units.length, units.time
+
+
+def _scale(mapping: UnitMapping, power: tuple[int, int]) -> tuple[float, float]:
+    """L0^a t0^b in the movie's units, and its relative error."""
+    terms = ((mapping.length, mapping.length_error), (mapping.time, mapping.time_error))
+    used = [(value, error, p) for (value, error), p in zip(terms, power, strict=True) if p]
+    return (
+        math.prod(value**p for value, _, p in used),
+        math.hypot(*(p * error / value for value, error, p in used)),
+    )
+
+
+def _both_systems_table(index: int, movie: Group, model: Group, mapping: UnitMapping) -> Table:
+    """Every number with a unit, of both sides, in the units of both sides."""
+    import pandas as pd
+
+    ours, theirs = movie.scalars(), model.scalars()
+    units, reduced = movie.members[0].units, model.members[0].units
+    rows, data = [], []
+    for key, scalar in ours.items():
+        # The mapping makes these two equal.
+        if scalar.power == (0, 0) or key in {"wave_number.mean_diameter", "tau_alpha.value"}:
+            continue
+        scale, relative = _scale(mapping, scalar.power)
+        if not math.isfinite(scale):
+            continue
+        factor, unit = scale_of(scalar.power, units)
+        numbers = [(scalar.value, scalar.std_error)]
+        numbers.append(_converted(scalar, 1 / (factor * scale), relative))
+        other = theirs.get(key)
+        if other is None:
+            numbers += [(math.nan, math.nan)] * 2
+        else:
+            numbers += [_converted(other, factor * scale, relative), (other.value, other.std_error)]
+        names = (unit, unit_text(scalar.power, reduced)) * 2
+        cells = [
+            f"{format_value(*n)}{NBSP}{u}" if math.isfinite(n[0]) else format_value(*n)
+            for n, u in zip(numbers, names, strict=True)
+        ]
+        rows.append(Row((scalar.label, *cells)))
+        data.append(
+            {"quantity": key, "unit": plain_unit(unit), "model_unit": plain_unit(names[1])}
+            | {
+                f"{side}{part}": number[k]
+                for side, number in zip(
+                    ("experiment", "experiment_in_model_unit", "simulation",
+                     "simulation_in_model_unit"), numbers, strict=True,
+                )
+                for k, part in enumerate(("", "_std_error"))
+            }
+        )  # fmt: skip
+    return Table(
+        f"both-systems-{index}",
+        f"{movie.name} and {model.name} in the units of both sides, through L_{{0}} and t_{{0}} of "
+        "this pair. Diameter and relaxation time coincide by that choice and are left out. Not "
+        "everything here may be compared: see the verdicts.",
+        ("Quantity", "Experiment, in its unit", "Experiment, in units of the model",
+         "Simulation, in the unit of the movie", "Simulation, in units of the model"),
+        ("", *("number",) * 4),
+        tuple(rows),
+        pd.DataFrame(data),
+    )  # fmt: skip
+
+
+def _converted(scalar: Scalar, factor: float, relative: float) -> tuple[float, float]:
+    value = scalar.value * factor
+    own = scalar.std_error * factor
+    return value, math.hypot(own, value * relative) if math.isfinite(own) else math.nan
+
+
+def _packing_rows(comparison: Comparison) -> tuple[Row, ...]:
+    return tuple(
         Row(
             (
                 group.name,
@@ -250,35 +397,4 @@ def units_section(comparison: Comparison, pairs: Pairs) -> Section | None:
         and math.isfinite(
             (phi := matched_scalars(group, area=comparison.area)["packing_fraction"]).value
         )
-    ]
-    tables = []
-    if rows:
-        tables.append(
-            Table("units", "L_{0} so that the mean diameters coincide, t_{0} so that the "
-                  "relaxation times coincide.",
-                  ("Pair", "L_{0}", "t_{0}", "v₀ of the scene"),
-                  ("", "number", "number", "number"), tuple(rows))
-        )  # fmt: skip
-    area, error = comparison.area
-    if packing:
-        tables.append(
-            Table("packing", f"Effective packing fraction: density × steric cell area, "
-                  f"{area:.0f} ± {error:.0f} µm^{{2}}.",
-                  ("Experiment", "Density (1/mm^{2})", "φ, effective"),
-                  ("", "number", "number"), tuple(packing))
-        )  # fmt: skip
-    if not tables:
-        return None
-    return Section(
-        "units",
-        "Units of the two sides",
-        text=(
-            "The model has no micrometres and no minutes. These are the values that its units take "
-            "if the two sides are the same material. They are a choice, and so nothing that was "
-            "used for it counts as agreement.",
-            "No one-to-one map leads from a density to a packing fraction, because real cells "
-            "spread and overlap. The effective φ orders the two sides; its error is mostly that "
-            "of the cell area, which is shared by all experiments.",
-        ),
-        tables=tuple(tables),
     )

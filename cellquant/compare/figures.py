@@ -122,6 +122,17 @@ def draw_curves(
         return to_svg(figure, name)
 
 
+def crossing(curve: Curve) -> float:
+    """Lag at which a curve first falls to 1/e, by linear interpolation; NaN where it does not."""
+    level = math.exp(-1)
+    below = np.flatnonzero(curve.y <= level)
+    if below.size == 0 or below[0] == 0:
+        return math.nan
+    i = int(below[0])
+    (x0, x1), (y0, y1) = curve.x[i - 1 : i + 1], curve.y[i - 1 : i + 1]
+    return float(x0 + (y0 - level) / (y0 - y1) * (x1 - x0))
+
+
 def count_legend_rows(curves: Sequence[Curve]) -> int:
     """Rows that the legend of these curves takes; none for a single curve."""
     named = [c for c in curves if c.label]

@@ -261,15 +261,16 @@ def _pool(parts: Sequence[Mapping[str, Scalar]], noun: str) -> dict[str, Scalar]
                 found[0], value=float(values.mean()), std_error=error, n=sample, rule=rule
             )
             continue
-        # A mean over those that relaxed alone would be too short: only a bound is known.
+        # A mean over those that relaxed alone would be too short. With the bounds in the place of
+        # the values that are not known it is a bound of the mean over all.
         bounds = [s.value if math.isfinite(s.value) else s.censored_at for s in found]
         pooled[key] = replace(
             found[0],
             value=math.nan,
             std_error=math.nan,
-            censored_at=float(np.nanmin(bounds)),
-            n=f"{sample}, {int((~known).sum())} censored",
-            rule=f"smallest bound over {noun}",
+            censored_at=float(np.mean(bounds)),
+            n=f"{sample}, {int((~known).sum())} not reached",
+            rule=f"mean over {noun}, with the bound in the place of a value that is not reached",
         )
     return pooled
 

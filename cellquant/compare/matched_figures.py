@@ -13,6 +13,7 @@ from cellquant.compare.figures import (
     Scale,
     common_limits,
     count_legend_rows,
+    crossing,
     draw_curves,
 )
 from cellquant.compare.groups import Group
@@ -67,8 +68,9 @@ def scattering_figure(groups: Sequence[Group]) -> Figure | None:
         sides,
         name="self-intermediate-scattering",
         title="Memory of places: self-intermediate scattering",
-        caption="At q = 2π/d. The dotted line is 1/e. Scenes and movies that do not relax have no "
-        "τ_{α} and are left out here.",
+        caption="At q = 2π/d. The dotted line is 1/e. Where some of the recordings do not relax "
+        "while they last, time is in units of that at which the mean curve falls to 1/e; where it "
+        "does not fall so far either, the group is left out here.",
         alt="F_s against time in units of the relaxation time",
         x=Scale("t/τ_{α}", log=True, limits=common_limits([c.x for c in every], log=True)),
         y=Scale("F_{s}(q, t)", limits=(min(-0.08, lowest - 0.02), 1.08)),
@@ -188,7 +190,12 @@ def path_figures(groups: Sequence[Group]) -> list[Figure]:
         table = tracks.table[["track_id", "frame", "x", "y"]].copy()
         table[["x", "y"]] /= d.value
         recent, span = _recent(table, group, tracks.frame_interval)
-        low, high = table[["x", "y"]].min().to_numpy(), table[["x", "y"]].max().to_numpy()
+        if tracks.box is None:
+            low, high = table[["x", "y"]].min().to_numpy(), table[["x", "y"]].max().to_numpy()
+        else:
+            low, high = np.zeros(2), np.array(tracks.box) / d.value
+            ends = recent.groupby("track_id")[["x", "y"]].transform("last")
+            recent = recent.assign(**(recent[["x", "y"]] - np.floor(ends / high) * high))
         middle = 0.5 * (low + high)
         square = (middle[0] - SQUARE / 2, middle[0] + SQUARE / 2,
                   middle[1] - SQUARE / 2, middle[1] + SQUARE / 2)  # fmt: skip
@@ -215,7 +222,8 @@ def path_figures(groups: Sequence[Group]) -> list[Figure]:
             "Trajectories",
             "The last two relaxation times, or the whole recording where τ_{α} is not known or the "
             "recording is shorter. Dots mark where the paths end; lengths are in mean cell "
-            "diameters d. The marked square is enlarged below. In the CSV, drawing counts from 1.",
+            "diameters d. Of a simulated layer, which is periodic, one period is shown. The marked "
+            "square is enlarged below. In the CSV, drawing counts from 1.",
         ),
         "close": (
             "Trajectories, enlarged to the same scale",
@@ -281,17 +289,25 @@ def _by_side(groups: Sequence[Group], measure: Measure) -> list[tuple[str, list[
 def _scaled(table: str, *, by_tau: bool, by_area: bool = False) -> Measure:
     def measure(group: Group, series: int) -> list[Curve]:
         curve = group.curve(table, series=series)
-        scalars = group.scalars()
-        tau, d = scalars.get("tau_alpha.value"), scalars.get("wave_number.mean_diameter")
-        if curve is None or tau is None or not math.isfinite(tau.value):
+        tau, d = _time_unit(group), group.scalars().get("wave_number.mean_diameter")
+        if curve is None or not math.isfinite(tau):
             return []
         if by_area and d is None:
             return []
         unit = d.value**2 if by_area and d is not None else 1.0
         error = None if curve.error is None else curve.error / unit
-        return [replace(curve, x=curve.x / tau.value, y=curve.y / unit, error=error)]
+        return [replace(curve, x=curve.x / tau, y=curve.y / unit, error=error)]
 
     return measure
+
+
+def _time_unit(group: Group) -> float:
+    """tau_alpha; where a trial does not reach it, the time at which the mean F_s falls to 1/e."""
+    tau = group.scalars().get("tau_alpha.value")
+    if tau is None or math.isfinite(tau.value):
+        return math.nan if tau is None else tau.value
+    curve = group.curve("self_intermediate_scattering")
+    return math.nan if curve is None else crossing(curve)
 
 
 def _paired(
@@ -331,6 +347,7 @@ def _paired(
 def _own_time(groups: Sequence[Group], label: str) -> tuple[float, str] | None:
     for group in groups:
         tau = group.scalars().get("tau_alpha.value")
-        if group.name == label and tau is not None and math.isfinite(tau.value):
-            return tau.value, f"t ({tau.unit}), {label}"
+        unit = _time_unit(group)
+        if group.name == label and tau is not None and math.isfinite(unit):
+            return unit, f"t ({tau.unit}), {label}"
     return None

@@ -286,6 +286,7 @@ def methods_section(
     """Every setting, version, seed and input digest, and the commands that repeat the work."""
     groups = []
     commands = []
+    told: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {}
     for name, record in records:
         every = [*record.get("earlier", []), record]
         for part in every:
@@ -293,7 +294,13 @@ def methods_section(
             label = f"{name}: " if name else ""
             command = str(part.get("command", "analysis"))
             if settings:
-                groups.append(Settings(f"{label}Settings of {command}", flatten(settings)))
+                entries = flatten(settings)
+                first, known = told.setdefault(command, (name, frozenset(entries)))
+                title = f"{label}Settings of {command}"
+                if first != name:
+                    title += f", where they differ from those of {first}"
+                    entries = tuple(entry for entry in entries if entry not in known)
+                groups.append(Settings(title, entries))
             inputs = part.get("inputs", {})
             if inputs:
                 groups.append(

@@ -205,6 +205,11 @@ def read_result(source: "str | Path | Observables | Result", *, name: str = "") 
     return Result(name or folder.resolve().name, summary, tables, record, folder)
 
 
+def meanings() -> dict[str, tuple[str, str]]:
+    """Label of every scalar, and how it is obtained, by key."""
+    return {entry.key: (entry.label, entry.rule or "2π/d, unless given") for entry in _CATALOGUE}
+
+
 def look_up(summary: Mapping[str, Any], key: str) -> Any:
     """Value at a dotted place of a summary; None where there is none."""
     found: Any = summary

@@ -13,6 +13,7 @@ from cellquant.compare.figures import (
     Scale,
     common_limits,
     count_legend_rows,
+    crossing,
     draw_boxes,
     draw_curves,
     draw_map,
@@ -165,7 +166,7 @@ def _by_density(groups: Sequence[Group]) -> tuple[str, list[Curve]] | None:
                 Curve(f"{centre:.0f} (n = {n})", np.array(error.index, dtype=np.float64),
                       lags["value"].mean().to_numpy(), error.to_numpy(), series)
             )  # fmt: skip
-        unit = _crossing(curves[0])
+        unit = crossing(curves[0])
         if math.isfinite(unit):
             scaled = [replace(c, x=c.x / unit) for c in curves]
             return f"Experiment: {group.name}", scaled
@@ -188,22 +189,11 @@ def _by_packing(groups: Sequence[Group]) -> tuple[str, list[Curve]] | None:
             curve = scenes[phi].curve("self_intermediate_scattering", series=number)
             if curve is not None:
                 curves.append(replace(curve, label=f"φ = {phi:g} (n = {scenes[phi].n})"))
-        unit = _crossing(curves[0]) if curves else math.nan
+        unit = crossing(curves[0]) if curves else math.nan
         if len(curves) > 1 and math.isfinite(unit):
             scaled = [replace(c, x=c.x / unit) for c in curves]
             return f"Simulation: v₀ = {v0:g}, η = {eta:g}", scaled
     return None
-
-
-def _crossing(curve: Curve) -> float:
-    """Lag at which a curve first falls to 1/e, by linear interpolation; NaN where it does not."""
-    level = math.exp(-1)
-    below = np.flatnonzero(curve.y <= level)
-    if below.size == 0 or below[0] == 0:
-        return math.nan
-    i = int(below[0])
-    (x0, x1), (y0, y1) = curve.x[i - 1 : i + 1], curve.y[i - 1 : i + 1]
-    return float(x0 + (y0 - level) / (y0 - y1) * (x1 - x0))
 
 
 def boxes_figure(groups: Sequence[Group], table: str, label: str) -> Figure | None:

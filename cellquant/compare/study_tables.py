@@ -122,7 +122,7 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
                     f"{test['first']}, {test['second']}",
                     test["test"],
                     f"{test['n_first']}, {test['n_second']}",
-                    "" if effect is None else f"{effect:.2f}",
+                    "–" if effect is None else f"{effect:.2f}",
                     _p_value(test["p_value"]),
                     _p_value(test["p_holm"]),
                     test["reason"] or "",
@@ -153,12 +153,7 @@ def _trends(models: Mapping[str, Mapping[str, Any]], units: Units) -> Table:
         notes = []
         if model["singular"]:
             notes.append("singular: the trials do not tell both random effects apart")
-        if model["n_censored"]:
-            bound = model["at_bound"]
-            notes.append(
-                f"{model['n_censored']} values not reached are left out; at their bounds the slope "
-                f"is {format_value(bound['slope'], bound['std_error'])}"
-            )
+        notes += _bounds_note(model)
         rows.append(
             Row(
                 (
@@ -170,7 +165,7 @@ def _trends(models: Mapping[str, Mapping[str, Any]], units: Units) -> Table:
                     ),
                     f"{model['df']:.1f}",
                     _p_value(model["p_value"]),
-                    f"{model['n']} of {model['n_groups']} trials",
+                    f"{model['n']} in {model['n_groups']} trials",
                     "; ".join(notes),
                 )
             )
@@ -178,8 +173,8 @@ def _trends(models: Mapping[str, Mapping[str, Any]], units: Units) -> Table:
     return Table(
         name="trends",
         caption="Relaxation time against density: linear mixed model with random intercept and "
-        f"slope per trial, REML. Slope in {unit_text((0, 1), units)} per {density}; freedom: its "
-        "degrees of freedom after Satterthwaite.",
+        f"slope per trial, restricted likelihood. Slope in {unit_text((0, 1), units)} per "
+        f"{density}; degrees of freedom after Satterthwaite.",
         columns=(
             "Condition",
             "Slope",
@@ -194,7 +189,25 @@ def _trends(models: Mapping[str, Mapping[str, Any]], units: Units) -> Table:
     )
 
 
+def _bounds_note(model: Mapping[str, Any]) -> list[str]:
+    """What became of relaxation times that are only known as bounds, and what else they allow."""
+    number = model.get("n_censored", 0) + model.get("n_below", 0)
+    if not number:
+        return []
+    others = [
+        f"{words} the slope is {format_value(fit['slope'], fit['std_error'])}"
+        for name, words in (("without_bounds", "without them"), ("at_bound", "with each at its "
+                            "bound"))
+        if (fit := model.get(name)) and fit["slope"] is not None
+    ]  # fmt: skip
+    if model.get("bounds_reason"):
+        used = f"are left out ({model['bounds_reason']})"
+    else:
+        used = "enter as bounds"
+    return [", ".join([f"{number} of the times are only known as bounds and {used}", *others])]
+
+
 def _p_value(value: float | None) -> str:
     if value is None:
-        return ""
+        return "–"
     return f"{value:.2g}" if value >= 1e-4 else "< 0.0001"
