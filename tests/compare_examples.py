@@ -143,13 +143,14 @@ def make_layer(
 
 
 def _run_of(points: np.ndarray, spacing: float, extent: float, seed: int) -> SimpleNamespace:
-    """The last state of a run, as far as a snapshot needs it."""
+    """Three states of a run, as far as snapshots need them."""
     rng = np.random.default_rng(seed)
     n = len(points)
     return SimpleNamespace(
-        position=points[None],
-        polarity=rng.uniform(0, 2 * np.pi, (1, n)),
-        modes=rng.normal(0, 0.04, (1, n, 2, 5)),
+        time=np.array([50.0, 60.0, 70.0]),
+        position=points[None] + rng.normal(0, 0.05 * spacing, (3, n, 2)),
+        polarity=rng.uniform(0, 2 * np.pi, (3, n)),
+        modes=rng.normal(0, 0.04, (3, n, 2, 5)),
         radius=np.full(n, spacing / 2),
         box=np.array([extent, extent]),
         scene=SimpleNamespace(phi=0.97, v0=0.03, eta=0.01),

@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numba
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 # The quick profile draws the same examples in every run; the thorough one draws new ones:
 # HYPOTHESIS_PROFILE=thorough make test
-settings.register_profile("quick", derandomize=True)
+settings.register_profile(
+    "quick", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.register_profile("thorough", max_examples=500, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 

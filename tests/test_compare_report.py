@@ -21,7 +21,7 @@ from cellquant.compare.report import command_lines, experiment_report
 from cellquant.compare.results import Result, read_result, read_scalars, unit_text
 from cellquant.compare.svg import THEME, compact_path
 from cellquant.errors import InputError
-from cellquant.tables import PHYSICAL, REDUCED
+from cellquant.tables import PHYSICAL, PIXEL, REDUCED
 from compare_examples import Layer, Stack, make_layer
 
 
@@ -340,6 +340,37 @@ def test_cell_across_the_edge_of_the_box_is_drawn_on_both_sides() -> None:
     corner = draw_contours(disc[None] + (30.1, -0.1), (10.0, 10.0), units=REDUCED)
     assert [inside.count(end) for end in ("z", "zM")] == [2, 0]  # one is in "font-size"
     assert corner.count("zM") == 3
+
+
+def test_moments_of_a_simulated_layer_are_drawn_alike() -> None:
+    angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    disc = 1.5 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    cells = np.array(
+        [disc + np.array([3, 4]), disc + np.array([9.9, 8])]
+    )  # the second crosses an edge
+    svg = draw_contours(cells, (10.0, 10.0), units=REDUCED, title="now", earlier=[("then", cells)])
+    assert re.findall(r'data-title="(\w+)"( display="none")?', svg) == [
+        ("then", ' display="none"'), ("now", ""),
+    ]  # fmt: skip
+    picture = decode(svg)
+    height, width = picture.shape[:2]
+    fills = re.findall(r'fill="#([0-9a-f]{6})"', svg)
+
+    def seen(x: float, y: float) -> str:
+        blue, green, red, alpha = picture[int(y / 10 * height), int(x / 10 * width)]
+        return f"{red:02x}{green:02x}{blue:02x}" if alpha else ""
+
+    assert seen(3, 4) in fills
+    assert seen(9.5, 8) == seen(0.5, 8) in fills
+    assert seen(3, 4) != seen(9.5, 8)
+    assert seen(6, 1) == ""
+
+
+def test_a_cell_without_a_track_is_grey() -> None:
+    labels = np.kron(np.array([[1, 2]]), np.ones((8, 8), np.int32))
+    picture = decode(draw_masks([MaskFrame(labels, identities={1: 5})], pixel_size=1, units=PIXEL))
+    ours, strange = picture[4, 3, :3].astype(int), picture[4, 12, :3].astype(int)
+    assert np.ptp(strange) < 8 < np.ptp(ours)
 
 
 def test_thinned_paths_keep_ends_and_a_bound(layer: Layer) -> None:

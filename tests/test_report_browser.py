@@ -259,6 +259,19 @@ def test_stepping_through_frames_by_keyboard(browser, pages: dict[str, Path]) ->
         assert visit.messages == []
 
 
+def test_stepping_through_both_sides_of_a_comparison(browser, pages: dict[str, Path]) -> None:
+    with Visit(browser, pages["comparison"]) as visit:
+        panels = visit.page.locator("#layer .panel")
+        assert panels.count() == 2
+        for index in range(2):
+            shown = panels.nth(index).locator("svg .step:not([display])")
+            title = shown.get_attribute("data-title")
+            panels.nth(index).get_by_role("slider").press("Home")
+            assert shown.count() == 1
+            assert shown.get_attribute("data-title") != title
+        assert visit.messages == []
+
+
 @pytest.mark.parametrize("width", [320, 390, 768])
 def test_narrow_screens_do_not_scroll_sideways(browser, path: Path, width: int) -> None:
     with Visit(browser, path, viewport={"width": width, "height": 800}) as visit:

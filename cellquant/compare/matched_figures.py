@@ -24,10 +24,15 @@ from cellquant.compare.sources import with_sources
 if TYPE_CHECKING:
     import pandas as pd
 
+    from cellquant.compare.pictures import MaskFrame
+    from cellquant.io import LabelStack
+
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 MAX_CURVES = 6
 MAX_PICTURES = 3
 MAX_PATH_POINTS = 2500
+MAX_STEPS = 5  # moments of a layer to step through
+ALL = 2**31  # frames, more than any recording has
 SQUARE = 8.0  # mean diameters, edge of the enlarged part of the trajectories
 Measure = Callable[[Group, int], list[Curve]]
 
@@ -137,26 +142,42 @@ def hove_figure(groups: Sequence[Group]) -> Figure | None:
 
 
 def layer_figure(groups: Sequence[Group]) -> Figure | None:
-    """Segmented frame of a movie beside a snapshot of the model."""
-    from cellquant.compare.pictures import MaskFrame, contours_of, draw_contours, draw_masks
+    """Segmented frames of a movie beside snapshots of the model, to step through."""
+    from cellquant.compare.pictures import STEP_PIXELS, contours_of, draw_contours, draw_masks
 
     panels = []
     for index, group in enumerate(with_pictures(groups)):
         result = group.members[0]
         name = f"layer-{index + 1}"
         if result.stack is not None:
-            frame = len(result.stack) - 1
+            frames = _mask_frames(group, result.stack)
             calibration = result.stack.calibration
             svg = draw_masks(
-                [MaskFrame(result.stack[frame])],
+                frames,
+                shown=len(frames) - 1,
                 pixel_size=calibration.pixel_size,
                 units=calibration.units,
+                step_pixels=STEP_PIXELS,
             )
             words = (
-                f"Segmented frame {frame}, the last, of {group.name}, cells in different colours."
+                f"Segmented {frames[-1].title}, the last, of {group.name}, cells in different "
+                "colours."
             )
         elif result.run is not None:
-            svg = draw_contours(*contours_of(result.run), units=result.units)
+            run = result.run
+            times = np.asarray(run.time, dtype=np.float64)
+            interval = float(times[1] - times[0]) if times.size > 1 else 1.0
+            titles = {
+                frame: f"t = {times[frame] - times[0]:g} t₀"
+                for frame in _steps(group, times.size, interval)
+            }
+            *others, last = titles
+            svg = draw_contours(
+                *contours_of(run),
+                units=result.units,
+                title=titles[last],
+                earlier=[(titles[f], contours_of(run, frame=f, points=24)[0]) for f in others],
+            )
             words = f"Contours of all cells of {group.name} at the end of the run."
         else:
             continue
@@ -165,12 +186,39 @@ def layer_figure(groups: Sequence[Group]) -> Figure | None:
         return None
     return Figure(
         name="layer",
-        title="One moment",
-        caption="Last segmented frame of the movie; contours of all cells at the end of the "
-        "simulation, whose layer continues periodically at its edges.",
+        title="The layer at work",
+        caption="The first recording of each group at its end; step back through the two "
+        "relaxation times before, or the whole recording where τ_{α} is not known or it is "
+        "shorter. Movies: segmented cells. Simulations: contours of all cells; the layer continues "
+        "periodically at its edges. A cell keeps its colour; grey ones are not followed.",
         panels=tuple(panels),
         wide=True,
     )
+
+
+def _steps(group: Group, n_frames: int, interval: float) -> list[int]:
+    """Up to `MAX_STEPS` frames, evenly over the last two relaxation times, the last included."""
+    last = n_frames - 1
+    first = max(0, last - _two_relaxations(group, interval)) if last else 0
+    return sorted(set(np.linspace(first, last, MAX_STEPS).round().astype(int).tolist()))
+
+
+def _mask_frames(group: Group, stack: "LabelStack") -> "list[MaskFrame]":
+    from cellquant.compare.pictures import MaskFrame
+
+    tracks = group.members[0].tracks
+    frames = []
+    for index in _steps(group, len(stack), stack.calibration.frame_interval):
+        number = stack.frame_numbers[index]
+        title = f"frame {number}"
+        known = None
+        if tracks is not None:
+            here = tracks.table[tracks.table["frame"] == number]
+            known = dict(zip(here["label"].tolist(), here["track_id"].tolist(), strict=True))
+            if tracks.units.time != "frame":
+                title += f" (t = {number * tracks.frame_interval:g} {tracks.units.time})"
+        frames.append(MaskFrame(stack[index], title, identities=known))
+    return frames
 
 
 def path_figures(groups: Sequence[Group]) -> list[Figure]:
@@ -242,11 +290,18 @@ def _recent(
     table: "pd.DataFrame", group: Group, frame_interval: float
 ) -> "tuple[pd.DataFrame, str]":
     """The part of the trajectories that lies in the last two relaxation times."""
+    span = _two_relaxations(group, frame_interval)
+    known = span < ALL
+    words = "the last two relaxation times" if known else "the whole recording"
+    return table[table["frame"] > table["frame"].max() - span] if known else table, words
+
+
+def _two_relaxations(group: Group, frame_interval: float) -> int:
+    """Two relaxation times in frames; `ALL` where the relaxation time is not known."""
     tau = group.scalars().get("tau_alpha.value")
     if tau is None or not math.isfinite(tau.value):
-        return table, "the whole recording"
-    span = max(2, round(2 * tau.value / frame_interval))
-    return table[table["frame"] > table["frame"].max() - span], "the last two relaxation times"
+        return ALL
+    return max(2, round(2 * tau.value / frame_interval))
 
 
 def add_sources(groups: Sequence[Group]) -> list[Group]:

@@ -2,7 +2,7 @@
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -30,6 +30,7 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
 MAX_PIXELS = 900
 MAX_STEP_PIXELS = 450
+STEP_PIXELS = 360  # of the steps on a page with many layers
 MAX_POINTS = 12_000
 # Twelve tones of like lightness, readable on light and on dark ground (RGB).
 _TONES = np.array(
@@ -40,6 +41,7 @@ _TONES = np.array(
     ],
     dtype=np.uint8,
 )  # fmt: skip
+_PALE = np.array([190, 190, 186], dtype=np.uint8)  # of a cell without a track
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ class MaskFrame:
     raw
         (H, W) recorded image; when given, it is shown in grey with the outlines of the cells.
     identities
-        Track of each label: a cell then keeps its colour through the movie.
+        Track of each label: a cell then keeps its colour through the movie, and one without a
+        track is grey; labels choose the colours when None.
     """
 
     labels: IntArray
@@ -65,7 +68,12 @@ class MaskFrame:
 
 
 def draw_masks(
-    frames: Sequence[MaskFrame], *, shown: int = 0, pixel_size: float, units: Units
+    frames: Sequence[MaskFrame],
+    *,
+    shown: int = 0,
+    pixel_size: float,
+    units: Units,
+    step_pixels: int = MAX_STEP_PIXELS,
 ) -> str:
     """Draw label masks with a scale bar, as an ``<svg>`` element.
 
@@ -79,21 +87,24 @@ def draw_masks(
         Edge of a pixel, in ``units.length``.
     units
         Unit names, for the scale bar.
+    step_pixels
+        Pixels along an edge of the frames that are not seen first, at most.
 
     Returns
     -------
     str
-        The element; the picture inside has at most `MAX_PIXELS` pixels along an edge, the others
-        to step through at most `MAX_STEP_PIXELS`.
+        The element; the picture seen first has at most `MAX_PIXELS` pixels along an edge.
     """
     height, width = frames[shown].labels.shape
     if len(frames) == 1:
         body = _mask_image(frames[0], MAX_PIXELS)
     else:
         body = "".join(
-            _step(frame.title, _mask_image(frame, MAX_PIXELS), hidden=False)
-            if number == shown
-            else _step(frame.title, _mask_image(frame, MAX_STEP_PIXELS), hidden=True)
+            _step(
+                frame.title,
+                _mask_image(frame, MAX_PIXELS if number == shown else step_pixels),
+                hidden=number != shown,
+            )
             for number, frame in enumerate(frames)
         )
     return _framed(body, width, height, scale=1 / pixel_size, length_unit=units.length)
@@ -120,8 +131,12 @@ def _mask_image(frame: MaskFrame, limit: int) -> str:
         picture = np.dstack([grey, grey, grey])
         picture[edge] = tones[edge]
         data, kind = _encode(picture, ".jpg"), "jpeg"
+    return _image(data, kind, width, height)
+
+
+def _image(data: bytes, kind: str, width: float, height: float) -> str:
     return (
-        f'<image width="{width}" height="{height}" preserveAspectRatio="none" '
+        f'<image width="{width:g}" height="{height:g}" preserveAspectRatio="none" '
         f'href="data:image/{kind};base64,{base64.b64encode(data).decode()}"/>'
     )
 
@@ -131,7 +146,8 @@ def draw_contours(
     box: tuple[float, float],
     *,
     units: Units,
-    identities: IntArray | None = None,
+    title: str = "",
+    earlier: Sequence[tuple[str, FloatArray]] = (),
 ) -> str:
     """Draw the contours of a simulated layer in its periodic box, as an ``<svg>`` element.
 
@@ -141,15 +157,37 @@ def draw_contours(
         (N, K, 2) contour points of each cell, in ``units.length``.
     box
         Edges of the periodic box.
-    identities
-        (N,) numbers that choose the colours; the order of the cells when None.
+    units
+        Unit names, for the scale bar.
+    title
+        What is said of this moment where the reader can step through several.
+    earlier
+        Title and contours of other moments, drawn as pictures of few pixels.
     """
     size = 600.0
     scale = size / max(box)
     width, height = box[0] * scale, box[1] * scale
-    order = np.arange(len(contours)) if identities is None else identities
     groups: dict[int, list[str]] = {}
-    for number, contour in zip(order, contours, strict=True):
+    for number, points in _in_box(contours, box):
+        text = " L ".join(f"{px} {py}" for px, py in points * scale)
+        groups.setdefault(_tone(number), []).append(compact_path(f"M {text} z"))
+    paths = "".join(
+        f'<path d="{"".join(groups[tone])}" fill="{_hex(tone)}" stroke="{_hex(tone, 0.55)}"/>'
+        for tone in sorted(groups)
+    )
+    body = f'<g fill-opacity=".82" stroke-width="1" stroke-linejoin="round">{paths}</g>'
+    if earlier:
+        steps = [
+            _step(text, _contour_image(shape, box, width, height), hidden=True)
+            for text, shape in earlier
+        ]
+        body = "".join([*steps, _step(title, body, hidden=False)])
+    return _framed(body, width, height, scale=scale, length_unit=units.length)
+
+
+def _in_box(contours: FloatArray, box: tuple[float, float]) -> Iterator[tuple[int, FloatArray]]:
+    """Number and contour of every cell in the periodic box, once for each edge that it crosses."""
+    for number, contour in enumerate(contours):
         home = contour - np.floor(contour.mean(axis=0) / box) * box
         low, high = home.min(axis=0), home.max(axis=0)
         shifts = [
@@ -158,30 +196,42 @@ def draw_contours(
         ]
         for shift_x in shifts[0]:
             for shift_y in shifts[1]:
-                points = (home + np.array([shift_x, shift_y])) * scale
-                text = " L ".join(f"{px} {py}" for px, py in points)
-                groups.setdefault(_tone(int(number)), []).append(compact_path(f"M {text} z"))
-    paths = "".join(
-        f'<path d="{"".join(groups[tone])}" fill="{_hex(tone)}" stroke="{_hex(tone, 0.55)}"/>'
-        for tone in sorted(groups)
-    )
-    body = f'<g fill-opacity=".82" stroke-width="1" stroke-linejoin="round">{paths}</g>'
-    return _framed(body, width, height, scale=scale, length_unit=units.length)
+                yield number, home + np.array([shift_x, shift_y])
 
 
-def contours_of(run: "Run", *, points: int = 32) -> tuple[FloatArray, tuple[float, float]]:
-    """Contours (N, K, 2) of the cells in the last saved state of a run, and its box."""
+def _contour_image(
+    contours: FloatArray, box: tuple[float, float], width: float, height: float
+) -> str:
+    """Contours as a picture of few pixels, in the colours and the frame of `draw_contours`."""
+    import cv2
+
+    pixels = [max(1, round(STEP_PIXELS * edge / max(box))) for edge in box]
+    picture = np.zeros((pixels[1], pixels[0], 4), dtype=np.uint8)
+    fine = 4  # binary digits of a pixel that cv2 reads
+    for number, points in _in_box(contours, box):
+        tone = _TONES[_tone(number)]
+        corners = np.round(points / box * pixels * 2**fine).astype(np.int32)[None]
+        cv2.fillPoly(picture, corners, (*tone.tolist(), 209), shift=fine)
+        cv2.polylines(picture, corners, True, (*(0.55 * tone).astype(int).tolist(), 255),
+                      shift=fine)  # fmt: skip
+    return _image(_encode(picture, ".png"), "png", width, height)
+
+
+def contours_of(
+    run: "Run", *, frame: int = -1, points: int = 32
+) -> tuple[FloatArray, tuple[float, float]]:
+    """Contours (N, K, 2) of the cells in a saved state of a run, by default the last; its box."""
     angle = 2 * np.pi * np.arange(points) / points
-    modes = np.asarray(run.modes[-1], dtype=np.float64)
+    modes = np.asarray(run.modes[frame], dtype=np.float64)
     n = np.arange(2, modes.shape[-1] + 2)
     radius = np.asarray(run.radius, dtype=np.float64)
     a0 = np.sqrt(1 - 0.5 * (modes**2).sum(axis=(1, 2)))
     shape = a0[:, None] + modes[:, 0] @ np.cos(np.outer(n, angle))
     shape = shape + modes[:, 1] @ np.sin(np.outer(n, angle))
-    direction = angle[None] + np.asarray(run.polarity[-1], dtype=np.float64)[:, None]
+    direction = angle[None] + np.asarray(run.polarity[frame], dtype=np.float64)[:, None]
     reach = radius[:, None] * shape
     offsets = np.stack([reach * np.cos(direction), reach * np.sin(direction)], axis=-1)
-    contours: FloatArray = np.asarray(run.position[-1], dtype=np.float64)[:, None] + offsets
+    contours: FloatArray = np.asarray(run.position[frame], dtype=np.float64)[:, None] + offsets
     box = np.asarray(run.box, dtype=np.float64)
     return contours, (float(box[0]), float(box[1]))
 
@@ -315,8 +365,13 @@ def _tones_of(
     labels: IntArray, identities: Mapping[int, int] | None
 ) -> np.ndarray[Any, np.dtype[np.uint8]]:
     present, inverse = np.unique(labels, return_inverse=True)
-    known = identities or {}
-    tones = np.array([_TONES[_tone(known.get(int(v), int(v)))] for v in present], dtype=np.uint8)
+    if identities is None:
+        tones = np.array([_TONES[_tone(int(v))] for v in present], dtype=np.uint8)
+    else:
+        tones = np.array(
+            [_TONES[_tone(identities[v])] if v in identities else _PALE for v in present.tolist()],
+            dtype=np.uint8,
+        )
     tones[present <= 0] = 0
     out: np.ndarray[Any, np.dtype[np.uint8]] = tones[inverse.reshape(labels.shape)]
     return out
