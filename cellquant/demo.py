@@ -7,12 +7,13 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cellquant.closed_loop import GUARD, LENGTH, PIXEL, TIME, Loop, close_loop
+from cellquant.closed_loop import GUARD, LENGTH, MSD, PIXEL, TIME, Loop, close_loop
 from cellquant.config import SceneConfig
 from cellquant.pipeline import Step, observe_into, silent, track_movie
 from cellquant.storage import RunRecord, atomic_path, check_output, write_json
 
 if TYPE_CHECKING:
+    from cellquant.compare.groups import Group
     from cellquant.compare.page import Headline, Page, Section, Table
 
 
@@ -136,11 +137,17 @@ def _headlines(loop: Loop) -> "tuple[Headline, ...]":
     errors = loop.table.set_index("quantity")["error"]
     return tuple(
         Headline(f"Error of the {name}", _per_cent(float(errors[name])))
-        for name in ("mean shape index", "mean diameter", "mean speed", "relaxation time")
+        for name in (
+            "mean shape index",
+            "mean diameter",
+            "mean speed",
+            MSD.label,
+            "relaxation time",
+        )
     )
 
 
-_SMOOTHED = ("mean speed", "MSD at the relaxation time", "relaxation time")
+_SMOOTHED = ("mean speed", MSD.label, "relaxation time")
 _UNITS = {
     "1": "none",
     "L0": "L_{0}",
@@ -153,13 +160,17 @@ _UNITS = {
 
 
 def _per_cent(share: float) -> str:
+    if isnan(share):
+        return "not known"
+    return f"{_signed(100 * share)}\N{NO-BREAK SPACE}%"
+
+
+def _signed(value: float) -> str:
+    """A number with its sign, to two digits after the point; zero has none."""
     from cellquant.compare.page import MINUS
 
-    return (
-        "not known"
-        if isnan(share)
-        else f"{100 * share:+.2f}\N{NO-BREAK SPACE}%".replace("-", MINUS)
-    )
+    rounded = round(value, 2)
+    return f"{rounded:+.2f}".replace("-", MINUS) if rounded else "0.00"
 
 
 _STEP_TEXTS = (
@@ -190,7 +201,7 @@ def _error_table(loop: Loop) -> "Table":
                     format_value(row["measured"], row["measured_std_error"]),
                     _UNITS[row["unit"]],
                     _per_cent(shares[0]),
-                    format_value(round(row["error_in_std_errors"], 2)),
+                    "–" if isnan(shares[0]) else _signed(row["error_in_std_errors"]),
                     *(_per_cent(share) for share in shares[1:]),
                 ),
                 "none" if isnan(shares[0]) else "",
@@ -254,6 +265,18 @@ def _records(loop: Loop) -> list[dict[str, Any]]:
     return [{str(k): v for k, v in row.items()} for row in loop.table.to_dict("records")]
 
 
+def _in_one_period(group: "Group", loop: Loop) -> "Group":
+    """The group with its paths drawn in one period of the layer, on masks as in the run."""
+    from cellquant.tables import REDUCED
+
+    result = group.members[0]
+    if result.tracks is None or result.tracks.units == REDUCED:
+        return group
+    width, height = (LENGTH * edge for edge in loop.run.box)
+    tracks = replace(result.tracks, box=(width, height))
+    return replace(group, trials={"1": (replace(result, tracks=tracks),)})
+
+
 def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
     """The closed loop on the page: the table of errors and the two sides in matched figures."""
     from cellquant.compare import matched_figures
@@ -264,7 +287,7 @@ def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
     groups = read_groups(
         [folder / "found", folder / "truth"], names=["measured on masks", "known truth"]
     )
-    seen = matched_figures.add_sources(groups)
+    seen = [_in_one_period(group, loop) for group in matched_figures.add_sources(groups)]
     figures = (
         matched_figures.layer_figure(seen),
         *matched_figures.path_figures(seen),

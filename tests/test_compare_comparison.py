@@ -26,7 +26,9 @@ from cellquant.compare.comparison import (
     unit_mapping,
 )
 from cellquant.compare.comparison_page import command_of
+from cellquant.compare.comparison_tables import units_section
 from cellquant.compare.groups import Group, read_groups
+from cellquant.compare.matched_figures import scattering_figure
 from cellquant.compare.matching import Matched, matched_scalars
 from cellquant.compare.page import format_value
 from cellquant.compare.results import Result
@@ -165,6 +167,57 @@ def test_unit_mapping_makes_diameters_and_relaxation_times_coincide(movie, model
     assert mapping.time == pytest.approx(40 / 200)
     assert mapping.time_error == pytest.approx(mapping.time * math.hypot(0.06, 0.06))
     assert unit_mapping(second, first) is None
+
+
+def test_numbers_with_a_unit_stand_in_the_units_of_both_sides(movie, model) -> None:
+    comparison = cq.compare(movie.result("a"), model.result("b"))
+    (pair,) = comparison.pairs()
+    section = units_section(comparison, [(*pair, comparison.verdicts(*pair))])
+    assert section is not None
+    table = next(t for t in section.tables if t.name == "both-systems-1")
+    rows = table.data.set_index("quantity")
+    mapping = unit_mapping(*pair)
+    assert mapping is not None
+    speeds = [layer.summary["speed"] for layer in (movie, model)]
+    unit = mapping.length / mapping.time
+    spread = math.hypot(mapping.length_error / mapping.length, mapping.time_error / mapping.time)
+    row = rows.loc["speed.mean"]
+    assert (row["unit"], row["model_unit"]) == ("µm/min", "L0/t0")
+    assert row["experiment"] == pytest.approx(speeds[0]["mean"])
+    assert row["experiment_in_model_unit"] == pytest.approx(speeds[0]["mean"] / unit)
+    assert row["simulation_in_model_unit"] == pytest.approx(speeds[1]["mean"])
+    assert row["simulation"] == pytest.approx(speeds[1]["mean"] * unit)
+    for side, speed in (("experiment_in_model_unit", speeds[0]), ("simulation", speeds[1])):
+        own = speed["std_error"] / speed["mean"]
+        told = row[f"{side}_std_error"] / row[side]
+        assert told == pytest.approx(math.hypot(own, spread))
+    # Densities are shown per mm^2, the model's per L0^2.
+    density = rows.loc["density.mean"]
+    assert density["experiment_in_model_unit"] == pytest.approx(
+        density["experiment"] * 1e-6 * mapping.length**2
+    )
+    assert not {"tau_alpha.value", "wave_number.mean_diameter"} & set(rows.index)
+
+
+def test_a_bound_is_named_as_the_reason() -> None:
+    bound = number(math.nan, math.nan, reason="only a bound is known, > 5 t0")
+    known = number(3.0, 0.1, reason="it sets the unit")
+    for verdict in (judge(known, bound), judge(bound, known)):
+        assert verdict.reason == bound.reason
+
+
+def test_a_group_that_relaxes_in_part_is_drawn_in_its_own_time(movie, model) -> None:
+    summary = {**movie.summary, "tau_alpha": {"value": None, "censored_at": 70.0}}
+    slow = replace(movie.result("slow"), summary=summary)
+    figure = scattering_figure(read_groups([slow, model.result("b")]))
+    assert figure is not None
+    table = movie.tables["self_intermediate_scattering"]
+    drawn = figure.data[figure.data["result"] == "Experiment: slow"]
+    # The curve passes 1/e at 1.
+    at_one = np.interp(1.0, drawn["lag_over_tau_alpha"], drawn["value"])
+    assert at_one == pytest.approx(math.exp(-1), abs=1e-6)
+    scale = table["lag_time"].to_numpy() / drawn["lag_over_tau_alpha"].to_numpy()
+    np.testing.assert_allclose(scale, scale[0])
 
 
 def test_effective_packing_fraction_is_that_of_the_area_and_of_the_scene(movie, model) -> None:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 import cellquant as cq
 from cellquant.closed_loop import (
+    LENGTH,
     QUANTITIES,
     SMOOTHED,
     STAGES,
@@ -185,8 +186,9 @@ def test_every_number_behind_a_drawing_stands_in_a_table_beside_the_page(demo: P
             assert len(told) == len(shown) > 100
             for axis, side in zip("xy", run.box, strict=True):
                 away = told[axis] - told[f"{axis}_told"] / d
-                if stage == "truth":  # drawn in one period of the layer
-                    away -= np.round(away / (side / d)) * side / d
+                # Both are drawn in one period of the layer.
+                period = side / d * (LENGTH if stage == "found" else 1)
+                away -= np.round(away / period) * period
                 np.testing.assert_allclose(away, 0, atol=6e-4)
     # The recording: its own tables as they are.
     folder = demo / "recording"

@@ -298,7 +298,7 @@ def _number(value: Any) -> float:
 
 def _sample(key: str, count: Any, summary: Mapping[str, Any]) -> str:
     if isinstance(count, int):
-        return f"{count} cells"
+        return f"{count} contours"
     group = key.split(".")[0]
     frames = f"{summary.get('n_frames')} frames"
     if group in {"density", "wave_number"}:

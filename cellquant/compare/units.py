@@ -321,7 +321,7 @@ def render_units(converted: Mapping[str, Any]) -> str:
     for side, heading in (("measured", "Measured"), ("reduced", "Reduced")):
         lines.append(f"{heading:<12}{'value':>14}{'± error':>14}  {'unit':<10}from")
         for name, q in converted[side].items():
-            error = f"{q['std_error']:.2g}" if q["std_error"] > 0 else "-"
+            error = f"{float(format(q['std_error'], '.2g')):g}" if q["std_error"] > 0 else "-"
             lines.append(f"{name:<12}{q['value']:>14.6g}{error:>14}  {q['unit']:<10}{q['source']}")
         lines.append("")
     for check in converted["checks"]:
