@@ -371,7 +371,7 @@ def _both_systems_table(index: int, movie: Group, model: Group, mapping: UnitMap
         "everything here may be compared: see the verdicts.",
         ("Quantity", "Experiment, in its unit", "Experiment, in units of the model",
          "Simulation, in the unit of the movie", "Simulation, in units of the model"),
-        ("", *("number",) * 4),
+        ("",) * 5,
         tuple(rows),
         pd.DataFrame(data),
     )  # fmt: skip
