@@ -160,8 +160,8 @@ def layer_figure(groups: Sequence[Group]) -> Figure | None:
                 step_pixels=STEP_PIXELS,
             )
             words = (
-                f"Segmented {frames[-1].title}, the last, of {group.name}, cells in different "
-                "colours."
+                f"Segmented cells of {group.name} in different colours at {frames[-1].title}, the "
+                "last frame."
             )
         elif result.run is not None:
             run = result.run
@@ -210,13 +210,12 @@ def _mask_frames(group: Group, stack: "LabelStack") -> "list[MaskFrame]":
     frames = []
     for index in _steps(group, len(stack), stack.calibration.frame_interval):
         number = stack.frame_numbers[index]
-        title = f"frame {number}"
-        known = None
+        title, known = f"frame {number}", None
         if tracks is not None:
             here = tracks.table[tracks.table["frame"] == number]
             known = dict(zip(here["label"].tolist(), here["track_id"].tolist(), strict=True))
             if tracks.units.time != "frame":
-                title += f" (t = {number * tracks.frame_interval:g} {tracks.units.time})"
+                title = f"t = {number * tracks.frame_interval:g} {tracks.units.time}"
         frames.append(MaskFrame(stack[index], title, identities=known))
     return frames
 

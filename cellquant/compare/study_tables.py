@@ -201,10 +201,11 @@ def _bounds_note(model: Mapping[str, Any]) -> list[str]:
         if (fit := model.get(name)) and fit["slope"] is not None
     ]  # fmt: skip
     if model.get("bounds_reason"):
-        used = f"are left out ({model['bounds_reason']})"
+        used = f"left out ({model['bounds_reason']})"
     else:
-        used = "enter as bounds"
-    return [", ".join([f"{number} of the times are only known as bounds and {used}", *others])]
+        used = "taken as such"
+    times = "time is only known as a bound" if number == 1 else "times are only known as bounds"
+    return ["; ".join(filter(None, (f"{number} {times}, {used}", ", ".join(others))))]
 
 
 def _p_value(value: float | None) -> str:
