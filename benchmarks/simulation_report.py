@@ -106,6 +106,13 @@ def main():
                 for r in speed["scaling"]
             ]
             parts.append(table(["cells", "ns per cell and evaluation", "bytes per cell"], rows))
+        if compilation := load("compile_time"):
+            parts.append(
+                f"From an empty cache the first 2 t0 of the default scene take "
+                f"{number(compilation['compile_and_run'])} s of CPU, nearly all of it compilation "
+                f"(40 s are aimed at), and {number(compilation['cached'])} s afterwards "
+                "(`python benchmarks/compile_time.py`).\n"
+            )
         if speed.get("features"):
             rows = [[name, number(ratio)] for name, ratio in speed["features"].items()]
             parts.append(table(["scene", "specialised / general time"], rows))

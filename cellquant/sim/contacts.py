@@ -17,6 +17,7 @@ from cellquant.sim import (
     parts,
     pinches,
     quadrature,
+    records,
 )
 from cellquant.sim.scene import Scene, SimulationFailure
 
@@ -87,15 +88,16 @@ class Layer:
         size = outlines.samples_of(scene.modes) if contact == "exact" else points
         self._table, single = outlines.compass(scene.modes, size)
         spare = lanes.QUAD - 1  # rows that the last tile of cells may write to
-        self._record = np.zeros((n_cells + spare, outlines.record_length(n_modes)))[:n_cells]
+        self._record = np.zeros((n_cells + spare, records.record_length(n_modes)))[:n_cells]
         self._energy = np.zeros(n_cells)
         if contact == "exact":
             self._single = single
-            self._work = crossings.work(1)
+            self._work = crossings.work(1, size)
+            self._rim = outlines.rim(size)
             self._circle = np.zeros((size, 4))
             self._circle[:, :2] = self._table[:2].T
             self._quarter, self._starts = outlines.quarter_points(scene.modes)
-            self._grid = np.zeros((n_cells, 3, outlines.row_of_samples(size)), np.float32)
+            self._grid = np.zeros((n_cells, 2, outlines.row_of_samples(size)), np.float32)
             self._pattern = np.zeros((n_cells, 1 + 4 * n_modes), np.float32)
             self._tangent = np.zeros((n_cells, (2 * n_modes + 5) // 4 * 4))
         else:
@@ -241,7 +243,11 @@ class Layer:
         features = modes, tension, torque
         if kernel not in self._addresses:
             self._addresses[kernel] = kernel.address(arrays, *features)
-        parts.share(self._addresses[kernel], self._n_parts, arrays, *features)
+        address = self._addresses[kernel]
+        if self._n_parts == 1:
+            parts.alone(address, arrays, *features)
+        else:
+            parts.share(address, self._n_parts, arrays, *features)
 
     def _check(self, fault: int) -> None:
         if fault < 0:
@@ -249,7 +255,8 @@ class Layer:
         row = self._record[fault]
         reason = "the state is not finite"
         remedy = "take a smaller step or the adaptive integrator"
-        if np.isfinite(row[:2]).all() and np.isfinite(row[outlines.HEAD :]).all():
+        modes = row[records.HEAD : records.HEAD + 2 * len(self._modes)]
+        if np.isfinite(row[:2]).all() and np.isfinite(modes).all():
             reason, remedy = NO_SHAPE, DRAWN_OUT
         raise SimulationFailure(reason, remedy, cell=fault)
 
@@ -304,12 +311,12 @@ class Layer:
         while True:
             roots, sign = self._of_blocks
             if len(self._work[0]) < self._n_parts:
-                self._work = crossings.work(self._n_parts)
+                self._work = crossings.work(self._n_parts, self._table.shape[1])
             self._share(
                 crossings.crossings,
                 (
-                    self._record, self._grid, self._pattern, self._circle, self._table,
-                    self._first, self._other, self._shift, roots, self._root_first,
+                    self._record, self._grid, self._rim, self._pattern, self._circle,
+                    self._table, self._first, self._other, self._shift, roots, self._root_first,
                     self._root_last, sign, self._inside, self._fault, *self._work,
                 ),
                 self._modes,
@@ -323,8 +330,10 @@ class Layer:
 
     def _close_pinches(self) -> int:
         """End the arcs of pinched contours where they reach the centre; return the room used."""
+        if len(self._narrow) == 0:
+            return 0
         pinched = self._record[:, 4] < PINCHED * self.radius
-        if len(self._narrow) == 0 or not pinched.any():
+        if not pinched.any():
             return 0
         return int(
             pinches.add_gaps(

@@ -10,7 +10,7 @@ from typing import Any
 
 from numba import njit
 
-from cellquant.sim.outlines import HEAD
+from cellquant.sim.records import HEAD
 
 FLAGS = {"contract", "nsz", "arcp"}
 HULL_MARGIN = 1e-4  # of the cubic through two samples, relative to A0
@@ -134,7 +134,7 @@ def variations(g0: float, g1: float, d0: float, d1: float, width: float, margin:
     return 2 if max(b1, b2) > -margin else 0
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def search_closely(
     record: Any, i: int, j: int, dx: float, dy: float, compass: Any, start: int, count: int,
     modes: Any, stack: Any, found: Any,

@@ -178,6 +178,25 @@ def _store(_: Any, array: Any, at: Any, vector: Any) -> Any:
     return types.void(array, types.intp, vector), generate
 
 
+def _peek(_: Any, array: Any, at: Any) -> Any:
+    """The number at a flat index of an array, which is not counted from its end."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.load(_pointer(context, builder, signature.args[0], args[0], args[1]))
+
+    return array.dtype(array, types.intp), generate
+
+
+def _poke(_: Any, array: Any, at: Any, value: Any) -> Any:
+    """Put a number at a flat index of an array."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store(args[2], _pointer(context, builder, signature.args[0], args[0], args[1]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, array.dtype), generate
+
+
 def _choose(_: Any, mask: Any, a: Any, b: Any) -> Any:
     """Lane by lane a where the mask is true, else b."""
     common = _common(a, b)
@@ -244,12 +263,44 @@ def _halved_bits(_: Any, a: Any, constant: Any) -> Any:
     """Take half the bits of every lane, as a whole number, from a constant."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        whole = ir.VectorType(ir.IntType(64), QUAD)
-        halves = builder.lshr(builder.bitcast(args[0], whole), ir.Constant(whole, [1] * QUAD))
-        number = ir.Constant(whole, [constant.literal_value] * QUAD)
+        whole = _whole(a)
+        halves = builder.lshr(builder.bitcast(args[0], whole), ir.Constant(whole, [1] * a.lanes))
+        number = ir.Constant(whole, [constant.literal_value] * a.lanes)
         return builder.bitcast(builder.sub(number, halves), args[0].type)
 
-    return a(a, constant) if a == DOUBLES else None, generate
+    return a(a, constant) if a.kind is types.float64 else None, generate
+
+
+def _whole(kind: Any) -> Any:
+    """Whole numbers as wide as the lanes of a vector."""
+    return ir.VectorType(ir.IntType(64 if kind.kind is types.float64 else 32), kind.lanes)
+
+
+def _signs(name: str) -> Any:
+    def combine(_: Any, a: Any, b: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            left, right = (builder.bitcast(arg, _whole(a)) for arg in args)
+            return builder.bitcast(getattr(builder, name)(left, right), a.native)
+
+        return a(a, b) if a == b else None, generate
+
+    combine.__doc__ = f"Lane by lane {name.strip('_')} of the bits, of which the sign is meant."
+    return intrinsic(combine)
+
+
+def _pick(_: Any, sign: Any, a: Any, b: Any) -> Any:
+    """Lane by lane a where the sign is set, else b."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        a_, b_ = (
+            _spread(context, builder, value, kind, sign)
+            for value, kind in zip(args[1:], signature.args[1:], strict=True)
+        )
+        whole = _whole(sign)
+        below = builder.icmp_signed("<", builder.bitcast(args[0], whole), ir.Constant(whole, None))
+        return builder.select(below, a_, b_)
+
+    return sign(sign, a, b), generate
 
 
 def _widener(pair: bool) -> Any:
@@ -299,6 +350,15 @@ def _trailing_zeros(_: Any, word: Any) -> Any:
     return types.intp(types.uint64), generate
 
 
+def _count_ones(_: Any, word: Any) -> Any:
+    """Count the bits of a word that are set."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.ctpop(args[0])
+
+    return types.intp(types.uint64), generate
+
+
 def _transpose(builder: Any, a: Any, b: Any, c: Any, d: Any) -> list[Any]:
     ab = [_shuffle(builder, a, b, order) for order in ([0, 4, 2, 6], [1, 5, 3, 7])]
     cd = [_shuffle(builder, c, d, order) for order in ([0, 4, 2, 6], [1, 5, 3, 7])]
@@ -326,6 +386,29 @@ def _scatter(_: Any, array: Any, at: Any, stride: Any, a: Any, b: Any, c: Any, d
 
     known = a.kind is types.float64
     return types.void(array, types.intp, types.intp, a, b, c, d) if known else None, generate
+
+
+def _scatter_rows(
+    _: Any, array: Any, rows: Any, at: Any, plus: Any, a: Any, b: Any, c: Any, d: Any
+) -> Any:
+    """Put lane r of four vectors of doubles side by side, at the flat index rows[at + r] + plus."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = args[2]
+        for first in range(0, a.lanes, 4):
+            order = list(range(first, first + 4))
+            quads = [_shuffle(builder, vector, vector, order) for vector in args[4:]]
+            for vector in _transpose(builder, *quads):
+                row = builder.load(_pointer(context, builder, signature.args[1], args[1], place))
+                row = builder.add(row, args[3])
+                pointer = _pointer(context, builder, signature.args[0], args[0], row)
+                builder.store(vector, builder.bitcast(pointer, vector.type.as_pointer()), align=8)
+                place = builder.add(place, ir.Constant(place.type, 1))
+        return context.get_dummy_value()
+
+    known = a.kind is types.float64
+    signature = types.void(array, rows, types.intp, types.intp, a, b, c, d)
+    return signature if known else None, generate
 
 
 def _gatherer(pair: bool) -> Any:
@@ -367,6 +450,8 @@ def _gatherer(pair: bool) -> Any:
 load: Any = _loader(False)
 load_pair: Any = _loader(True)
 store: Any = intrinsic(_store)
+peek: Any = intrinsic(_peek)
+poke: Any = intrinsic(_poke)
 gather: Any = _gatherer(False)
 gather_pair: Any = _gatherer(True)
 scatter: Any = intrinsic(_scatter)
@@ -379,9 +464,16 @@ floor: Any = _call("floor")
 ceiling: Any = _call("ceil")
 rough_root: Any = intrinsic(_rough_root)
 halved_bits: Any = intrinsic(prefer_literal=True)(_halved_bits)
+either: Any = _signs("or_")
+both: Any = _signs("and_")
+differ: Any = _signs("xor")
+pick: Any = intrinsic(_pick)
 widen_pair: Any = _widener(True)
 doubles: Any = _spreader(DOUBLES)
+doubles_pair: Any = _spreader(PAIRS[DOUBLES])
 singles: Any = _spreader(SINGLES)
 singles_pair: Any = _spreader(PAIRS[SINGLES])
 bits: Any = intrinsic(_bits)
 trailing_zeros: Any = intrinsic(_trailing_zeros)
+count_ones: Any = intrinsic(_count_ones)
+scatter_rows: Any = intrinsic(_scatter_rows)

@@ -1,11 +1,9 @@
 """Contours of all cells: what every contact rule reads, and the gradient of their lengths.
 
 In the frame of the laboratory a contour is rho(phi) = A0 + Re sum_n C_n exp(i n phi), with
-C_n = R0 (a_n - i b_n) exp(-i n theta). A record row holds x, y, A0, an upper bound of rho, a lower
-estimate of rho, cos theta, sin theta, R0, then the real and the imaginary parts of
-C_2 .. C_M.
+C_n = R0 (a_n - i b_n) exp(-i n theta).
 
-Cells are worked on in tiles of `QUAD`, one cell per lane of a vector instruction. The trapezoid
+Cells are worked on in tiles, one cell per lane of a vector instruction. The trapezoid
 rule of the length takes four points at once, phi, -phi, pi + phi and pi - phi, which share their
 sines and cosines. It starts with 16 max(6, M) - 8 points; the alternating sum over these estimates
 what aliasing costs, and cells that need more get the points between, as often as it takes.
@@ -20,24 +18,21 @@ from numba import njit
 from cellquant.sim.lanes import (
     LANES,
     QUAD,
-    choose,
-    doubles,
-    floor,
-    gather,
+    doubles_pair,
     greatest,
     halved_bits,
     least,
     load,
-    root,
-    scatter,
+    load_pair,
+    peek,
+    poke,
     singles,
     store,
 )
 from cellquant.sim.parts import shared
+from cellquant.sim.records import HEAD, write_records
 
-QUARTER_TURN, REST_OF_IT = 0.5 * math.pi, 6.123233995736766e-17
 GUESS = 0x5FE6EB50C7B537A9  # bits from which those of 1 / sqrt follow, to 3 %
-HEAD = 8  # entries of a record before the modes
 BLOCK = 32  # cells worked on together
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 ROUGH = 4e-5  # alternating sum above which the trapezoid rule takes twice the points
@@ -51,11 +46,6 @@ def samples_of(modes: int) -> int:
     return 8 * max(6, modes)
 
 
-def record_length(n_modes: int) -> int:
-    """Entries of a record, padded so that the modes are read four at a time."""
-    return HEAD + (2 * n_modes + QUAD - 1) // QUAD * QUAD
-
-
 def row_of_samples(size: int) -> int:
     """Entries of a row of `grid`: the samples one and a half times round, and room to read on."""
     return 3 * (size // 2) + 2 * LANES
@@ -67,6 +57,12 @@ def compass(modes: int, size: int) -> tuple[Any, Any]:
     rows = [f(n * angle) for n in range(1, max(modes, 1) + 1) for f in (np.cos, np.sin)]
     table = np.ascontiguousarray(rows)
     return table, table.astype(np.float32)
+
+
+def rim(size: int) -> Any:
+    """Cosine and sine of the directions of a row of `grid`, in single precision."""
+    angle = 2.0 * math.pi * np.arange(row_of_samples(size)) / size
+    return np.stack([np.cos(angle), np.sin(angle)]).astype(np.float32)
 
 
 def quarter_points(modes: int) -> tuple[Any, Any]:
@@ -94,163 +90,164 @@ def quarter_points(modes: int) -> tuple[Any, Any]:
     return np.ascontiguousarray(np.column_stack(columns)), starts
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def add_points(
     lane: Any, sums: Any, quarter: Any, begin: int, end: int, modes: Any, rays: Any
 ) -> None:
-    """Add at most `POINTS` points of one level, for a tile of cells.
+    """Add at most `POINTS` points of one level, for a tile of eight cells.
 
-    Rows of `lane`, QUAD apart: A0, Re C, Im C. Rows of `sums`: length, L_0, Re L, Im L and two
+    Rows of `lane`, LANES apart: A0, Re C, Im C. Rows of `sums`: length, L_0, Re L, Im L and two
     alternating sums. `rays` has room for 8 rows per point.
 
     Each pass is short, so that operations seldom wait for each other: 1.6 times as fast as one
     loop.
     """
     n_modes = len(modes)
-    row = 8 * QUAD
-    mean = load(lane, 0)
+    row = 8 * LANES
+    long = quarter.shape[1]
     for point in range(end - begin):
-        q = begin + point
-        even_c = mean
-        even_s = doubles(0.0)
-        even_b = doubles(0.0)
-        even_a = doubles(0.0)
-        for m in range(0, n_modes, 2):
-            re = load(lane, (1 + m) * QUAD)
-            im = load(lane, (1 + n_modes + m) * QUAD)
-            even_c += re * quarter[q, 4 * m + 1]
-            even_s += im * quarter[q, 4 * m + 2]
-            even_b += im * quarter[q, 4 * m + 3]
-            even_a += re * quarter[q, 4 * m + 4]
-        odd_c = doubles(0.0)
-        odd_s = doubles(0.0)
-        odd_b = doubles(0.0)
-        odd_a = doubles(0.0)
-        for m in range(1, n_modes, 2):
-            re = load(lane, (1 + m) * QUAD)
-            im = load(lane, (1 + n_modes + m) * QUAD)
-            odd_c += re * quarter[q, 4 * m + 1]
-            odd_s += im * quarter[q, 4 * m + 2]
-            odd_b += im * quarter[q, 4 * m + 3]
-            odd_a += re * quarter[q, 4 * m + 4]
-        # Radius, then slope, at phi, -phi, pi + phi, pi - phi.
+        q = (begin + point) * long
         at = point * row
+        even_c = load_pair(lane, 0)
+        even_s = doubles_pair(0.0)
+        odd_c = even_s
+        odd_s = even_s
+        for m in range(0, n_modes, 2):
+            even_c += load_pair(lane, (1 + m) * LANES) * peek(quarter, q + 4 * m + 1)
+            even_s += load_pair(lane, (1 + n_modes + m) * LANES) * peek(quarter, q + 4 * m + 2)
+        for m in range(1, n_modes, 2):
+            odd_c += load_pair(lane, (1 + m) * LANES) * peek(quarter, q + 4 * m + 1)
+            odd_s += load_pair(lane, (1 + n_modes + m) * LANES) * peek(quarter, q + 4 * m + 2)
+        # Radius at phi, -phi, pi + phi, pi - phi; then the slope there.
         store(rays, at, (even_c + odd_c) - (even_s + odd_s))
-        store(rays, at + 2 * QUAD, (even_c + odd_c) + (even_s + odd_s))
-        store(rays, at + 4 * QUAD, (even_c - odd_c) - (even_s - odd_s))
-        store(rays, at + 6 * QUAD, (even_c - odd_c) + (even_s - odd_s))
-        store(rays, at + QUAD, -(even_a + odd_a) - (even_b + odd_b))
-        store(rays, at + 3 * QUAD, (even_a + odd_a) - (even_b + odd_b))
-        store(rays, at + 5 * QUAD, (odd_a - even_a) - (even_b - odd_b))
-        store(rays, at + 7 * QUAD, (even_a - odd_a) - (even_b - odd_b))
-    length = load(sums, 0)
+        store(rays, at + 2 * LANES, (even_c + odd_c) + (even_s + odd_s))
+        store(rays, at + 4 * LANES, (even_c - odd_c) - (even_s - odd_s))
+        store(rays, at + 6 * LANES, (even_c - odd_c) + (even_s - odd_s))
+        even_b = doubles_pair(0.0)
+        even_a = even_b
+        odd_b = even_b
+        odd_a = even_b
+        for m in range(0, n_modes, 2):
+            even_b += load_pair(lane, (1 + n_modes + m) * LANES) * peek(quarter, q + 4 * m + 3)
+            even_a += load_pair(lane, (1 + m) * LANES) * peek(quarter, q + 4 * m + 4)
+        for m in range(1, n_modes, 2):
+            odd_b += load_pair(lane, (1 + n_modes + m) * LANES) * peek(quarter, q + 4 * m + 3)
+            odd_a += load_pair(lane, (1 + m) * LANES) * peek(quarter, q + 4 * m + 4)
+        store(rays, at + LANES, -(even_a + odd_a) - (even_b + odd_b))
+        store(rays, at + 3 * LANES, (even_a + odd_a) - (even_b + odd_b))
+        store(rays, at + 5 * LANES, (odd_a - even_a) - (even_b - odd_b))
+        store(rays, at + 7 * LANES, (even_a - odd_a) - (even_b - odd_b))
+    length = load_pair(sums, 0)
     for ray in range(4 * (end - begin)):
-        at = 2 * ray * QUAD
-        rho = load(rays, at)
-        slope = load(rays, at + QUAD)
+        at = 2 * ray * LANES
+        rho = load_pair(rays, at)
+        slope = load_pair(rays, at + LANES)
         square = rho * rho + slope * slope
         # 1 / sqrt: a guess to 3 %, then two steps of order three, to 3e-12.
         inverse = halved_bits(square, GUESS)
         for _ in range(2):
             error = 1.0 - (square * inverse) * inverse
             inverse += (inverse * error) * (0.5 + 0.375 * error)
-        inverse *= quarter[begin + ray // 4, 0]
+        inverse *= peek(quarter, (begin + ray // 4) * long)
         length += square * inverse
         store(rays, at, rho * inverse)
-        store(rays, at + QUAD, slope * inverse)
+        store(rays, at + LANES, slope * inverse)
     store(sums, 0, length)
     sign = 1.0
-    constant = load(sums, QUAD)
-    wave_u = load(sums, (2 + 2 * n_modes) * QUAD)
-    wave_v = load(sums, (3 + 2 * n_modes) * QUAD)
+    constant = load_pair(sums, LANES)
+    wave_u = load_pair(sums, (2 + 2 * n_modes) * LANES)
+    wave_v = load_pair(sums, (3 + 2 * n_modes) * LANES)
     for point in range(end - begin):
         at = point * row
-        u0 = load(rays, at)
-        u1 = load(rays, at + 2 * QUAD)
-        u2 = load(rays, at + 4 * QUAD)
-        u3 = load(rays, at + 6 * QUAD)
-        v0 = load(rays, at + QUAD)
-        v1 = load(rays, at + 3 * QUAD)
-        v2 = load(rays, at + 5 * QUAD)
-        v3 = load(rays, at + 7 * QUAD)
         sign = -sign
+        # What even modes are projected on comes first, then odd ones.
+        u0 = load_pair(rays, at)
+        u1 = load_pair(rays, at + 2 * LANES)
+        u2 = load_pair(rays, at + 4 * LANES)
+        u3 = load_pair(rays, at + 6 * LANES)
+        v0 = load_pair(rays, at + LANES)
+        v1 = load_pair(rays, at + 3 * LANES)
+        v2 = load_pair(rays, at + 5 * LANES)
+        v3 = load_pair(rays, at + 7 * LANES)
         even = (u0 + u1) + (u2 + u3)
         skew = (u0 - u1) + (u2 - u3)
-        turn = (v0 - v1) + (v2 - v3)
         constant += even
         wave_u += sign * skew
-        wave_v += sign * turn
-        # What even modes are projected on comes first, then odd ones.
         store(rays, at, even)
-        store(rays, at + QUAD, turn)
-        store(rays, at + 2 * QUAD, skew)
-        store(rays, at + 3 * QUAD, (v0 + v1) + (v2 + v3))
-        store(rays, at + 4 * QUAD, (u0 + u1) - (u2 + u3))
-        store(rays, at + 5 * QUAD, (v0 - v1) - (v2 - v3))
-        store(rays, at + 6 * QUAD, (u0 - u1) - (u2 - u3))
-        store(rays, at + 7 * QUAD, (v0 + v1) - (v2 + v3))
-    store(sums, QUAD, constant)
-    store(sums, (2 + 2 * n_modes) * QUAD, wave_u)
-    store(sums, (3 + 2 * n_modes) * QUAD, wave_v)
+        store(rays, at + 2 * LANES, skew)
+        store(rays, at + 4 * LANES, (u0 + u1) - (u2 + u3))
+        store(rays, at + 6 * LANES, (u0 - u1) - (u2 - u3))
+        turn = (v0 - v1) + (v2 - v3)
+        wave_v += sign * turn
+        store(rays, at + LANES, turn)
+        store(rays, at + 3 * LANES, (v0 + v1) + (v2 + v3))
+        store(rays, at + 5 * LANES, (v0 - v1) - (v2 - v3))
+        store(rays, at + 7 * LANES, (v0 + v1) - (v2 + v3))
+    store(sums, LANES, constant)
+    store(sums, (2 + 2 * n_modes) * LANES, wave_u)
+    store(sums, (3 + 2 * n_modes) * LANES, wave_v)
     for m in range(n_modes):
-        re = load(sums, (2 + m) * QUAD)
-        im = load(sums, (2 + n_modes + m) * QUAD)
-        less = doubles(0.0)
-        more = doubles(0.0)
-        parity = 4 * QUAD * (m % 2)
+        re = load_pair(sums, (2 + m) * LANES)
+        im = load_pair(sums, (2 + n_modes + m) * LANES)
+        less = doubles_pair(0.0)
+        more = doubles_pair(0.0)
+        parity = 4 * LANES * (m % 2)
         for point in range(end - begin):
             at = point * row + parity
-            q = begin + point
-            re += load(rays, at) * quarter[q, 4 * m + 1]
-            less += load(rays, at + QUAD) * quarter[q, 4 * m + 4]
-            im += load(rays, at + 2 * QUAD) * quarter[q, 4 * m + 2]
-            more += load(rays, at + 3 * QUAD) * quarter[q, 4 * m + 3]
-        store(sums, (2 + m) * QUAD, re - less)
-        store(sums, (2 + n_modes + m) * QUAD, im + more)
+            q = (begin + point) * long + 4 * m
+            re += load_pair(rays, at) * peek(quarter, q + 1)
+            less += load_pair(rays, at + LANES) * peek(quarter, q + 4)
+            im += load_pair(rays, at + 2 * LANES) * peek(quarter, q + 2)
+            more += load_pair(rays, at + 3 * LANES) * peek(quarter, q + 3)
+        store(sums, (2 + m) * LANES, re - less)
+        store(sums, (2 + n_modes + m) * LANES, im + more)
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def fill_lanes(lane: Any, cells: Any, begin: int, count: int, record: Any, modes: Any) -> None:
     """Copy the contours of a tile of cells into lanes; empty lanes repeat the last cell."""
-    for r in range(QUAD):
-        i = cells[begin + min(r, count - 1)]
-        lane[r] = record[i, 2]
+    stride = record.shape[1]
+    for r in range(LANES):
+        at = peek(cells, begin + min(r, count - 1)) * stride
+        poke(lane, r, peek(record, at + 2))
         for m in range(2 * len(modes)):
-            lane[(1 + m) * QUAD + r] = record[i, HEAD + m]
+            poke(lane, (1 + m) * LANES + r, peek(record, at + HEAD + m))
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def gradient_of_length(
     cells: Any, count: int, lane: Any, sums: Any, record: Any, quarter: Any, starts: Any,
     modes: Any, tangent: Any, rays: Any,
 ) -> None:  # fmt: skip
     """Length of the contours of some cells and its gradient; reorders `cells`."""
     n_modes = len(modes)
-    wave = (2 + 2 * n_modes) * QUAD
+    wave = (2 + 2 * n_modes) * LANES
+    stride = tangent.shape[1]
     share = 2.0 * math.pi / (4 * starts[1])
     for level in range(LEVELS):
         rough = 0
-        for begin in range(0, count, QUAD):
-            filled = min(QUAD, count - begin)
+        for begin in range(0, count, LANES):
+            filled = min(LANES, count - begin)
             fill_lanes(lane, cells, begin, filled, record, modes)
             sums[:] = 0.0
             for q in range(starts[level], starts[level + 1], POINTS):
                 last = min(q + POINTS, starts[level + 1])
                 add_points(lane, sums, quarter, q, last, modes, rays)
             for r in range(filled):
-                i = cells[begin + r]
+                i = peek(cells, begin + r)
+                at = i * stride
                 if level == 0:
-                    a = sums[wave + r] * share
-                    b = sums[wave + QUAD + r] * share
+                    a = peek(sums, wave + r) * share
+                    b = peek(sums, wave + LANES + r) * share
                     for row in range(2 + 2 * n_modes):
-                        tangent[i, row] = share * sums[row * QUAD + r]
+                        poke(tangent, at + row, share * peek(sums, row * LANES + r))
                     off = a * a + b * b
                 else:
                     off = 0.0
                     for row in range(2 + 2 * n_modes):
-                        old = tangent[i, row]
-                        fresh = share * sums[row * QUAD + r]
-                        tangent[i, row] = 0.5 * (old + fresh)
+                        old = peek(tangent, at + row)
+                        fresh = share * peek(sums, row * LANES + r)
+                        poke(tangent, at + row, 0.5 * (old + fresh))
                         off = max(off, (old - fresh) * (old - fresh))
                 if off > ROUGH * ROUGH:
                     cells[rough] = i
@@ -262,7 +259,7 @@ def gradient_of_length(
             share *= 0.5
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def sample(
     i: int, record: Any, compass: Any, modes: Any, grid: Any, pattern: Any, work: Any
 ) -> tuple[float, float]:
@@ -278,7 +275,7 @@ def sample(
     pattern[i, 0] = np.float32(record[i, 2])
     highest = singles(0.0)
     lowest = singles(np.inf)
-    base = i * 3 * long
+    base = i * 2 * long
     for s in range(0, half, LANES):
         even = singles(pattern[i, 0])
         odd = singles(0.0)
@@ -300,20 +297,13 @@ def sample(
         there = even - odd
         highest = greatest(highest, greatest(here, there))
         lowest = least(lowest, least(here, there))
-        c = load(compass, s)
-        d = load(compass, size + s)
-        x = here * c
-        y = here * d
-        ratio = (even_slope + odd_slope) / here
-        store(grid, base + s, x)
-        store(grid, base + size + s, x)
-        store(grid, base + long + s, y)
-        store(grid, base + long + size + s, y)
-        store(grid, base + 2 * long + s, ratio)
-        store(grid, base + 2 * long + size + s, ratio)
-        store(grid, base + half + s, -there * c)
-        store(grid, base + long + half + s, -there * d)
-        store(grid, base + 2 * long + half + s, (even_slope - odd_slope) / there)
+        slope = even_slope + odd_slope
+        store(grid, base + s, here)
+        store(grid, base + size + s, here)
+        store(grid, base + half + s, there)
+        store(grid, base + long + s, slope)
+        store(grid, base + long + size + s, slope)
+        store(grid, base + long + half + s, even_slope - odd_slope)
     store(work, 0, highest)
     store(work, LANES, lowest)
     high = work[0]
@@ -324,89 +314,13 @@ def sample(
     return high, low
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def cosine_and_sine(angle: Any) -> tuple[Any, Any]:
-    """Cosine and sine of a vector to round-off; NaN where it is not finite."""
-    quarter = floor(angle * (2.0 / math.pi) + 0.5)
-    x = (angle - quarter * QUARTER_TURN) - quarter * REST_OF_IT
-    q = x * x
-    s = 1 / 362880 + q * (-1 / 39916800 + q * (1 / 6227020800 + q * (-1 / 1307674368000)))
-    s = x + x * q * (-1 / 6 + q * (1 / 120 + q * (-1 / 5040 + q * s)))
-    c = 1 / 479001600 + q * (-1 / 87178291200 + q * (1 / 20922789888000))
-    c = -1 / 720 + q * (1 / 40320 + q * (-1 / 3628800 + q * c))
-    c = 1.0 + q * (-0.5 + q * (1 / 24 + q * c))
-    place = quarter - 4.0 * floor(0.25 * quarter)
-    odd = (place == 1.0) | (place == 3.0)
-    cosine = choose(odd, s, c)
-    sine = choose(odd, c, s)
-    cosine = choose((place == 1.0) | (place == 2.0), -cosine, cosine)
-    return cosine, choose(place >= 2.0, -sine, sine)
-
-
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def write_records(
-    state: Any, radius: Any, begin: int, end: int, modes: Any, record: Any, places: Any,
-    columns: Any,
-) -> None:  # fmt: skip
-    """Records of a tile of cells, with R0 sum n^2 |C_n| / R0 in place of the largest radius.
-
-    A0 is NaN where it is not a number, and so is the lower estimate of rho everywhere.
-    """
-    n_modes = len(modes)
-    n_columns = state.shape[1]
-    stride = record.shape[1]
-    for r in range(QUAD):
-        places[r] = n_columns * min(begin + r, end - 1)
-    x, y, theta, _ = gather(state, places, 0, 0)
-    raw = (4 + 2 * n_modes) * QUAD
-    for m in range(0, 2 * n_modes, 4):
-        first = min(3 + m, n_columns - 4)
-        v0, v1, v2, v3 = gather(state, places, 0, first)
-        at = raw + (first + 1) * QUAD
-        store(columns, at, v0)
-        store(columns, at + QUAD, v1)
-        store(columns, at + 2 * QUAD, v2)
-        store(columns, at + 3 * QUAD, v3)
-    for r in range(QUAD):
-        columns[r] = radius[min(begin + r, end - 1)]
-    r0 = load(columns, 0)
-    cos_1, sin_1 = cosine_and_sine(theta)
-    for m in range(2 * n_modes, 2 * n_modes + 3):
-        store(columns, m * QUAD, doubles(0.0))  # the padding of a record
-    cos_n = cos_1
-    sin_n = sin_1
-    power = doubles(0.0)
-    bend = doubles(0.0)
-    for m in range(n_modes):
-        cos_n, sin_n = cos_n * cos_1 - sin_n * sin_1, sin_n * cos_1 + cos_n * sin_1
-        a = load(columns, raw + (4 + m) * QUAD)
-        b = load(columns, raw + (4 + n_modes + m) * QUAD)
-        square = a * a + b * b
-        power += square
-        bend += (m + 2.0) * (m + 2.0) * root(square)
-        store(columns, m * QUAD, r0 * (a * cos_n - b * sin_n))
-        store(columns, (n_modes + m) * QUAD, -r0 * (b * cos_n + a * sin_n))
-    none = doubles(math.nan)
-    fine = (power < 2.0) & (cos_1 * cos_1 < 2.0)
-    mean = choose(fine, r0 * root(1.0 - 0.5 * power), none)
-    # Lanes beyond the last cell write to the spare rows of the record.
-    scatter(record, begin * stride, stride, x, y, mean, r0 * bend)
-    scatter(record, begin * stride + 4, stride, none, cos_1, sin_1, r0)
-    for m in range(0, 2 * n_modes, 4):
-        scatter(
-            record, begin * stride + HEAD + m, stride, load(columns, m * QUAD),
-            load(columns, (m + 1) * QUAD), load(columns, (m + 2) * QUAD),
-            load(columns, (m + 3) * QUAD),
-        )  # fmt: skip
-
-
 @shared(FLAGS)
 def contours(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any) -> None:
     """Record every contour and its samples; with tension also the gradient of its length.
 
-    Writes `record`, the samples x, y and slope / rho of `grid` (N, 3, see
-    `row_of_samples`) in single precision, relative to the centre, in `pattern` A0, the modes and
-    n times the modes in single precision, and in `tangent` the length, L_0, then Re and Im of
+    Writes `record`, samples of rho and its slope in `grid` (N, 2, see `row_of_samples`) and in
+    `pattern` A0, the modes and n times the modes, both in single precision, and in `tangent` the
+    length, L_0, then Re and Im of
     L_n = integral (u + i n v) exp(i n phi), u = rho / |t|, v = slope / |t|. The lower estimate of
     rho is NaN where a0^2 <= 0.
     """
@@ -416,14 +330,17 @@ def contours(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, tor
     size = compass.shape[1]
     spacing = 2.0 * math.pi / size
     n_blocks = (n_cells + BLOCK - 1) // BLOCK
-    lane = np.empty(QUAD * (1 + 2 * n_modes))
-    sums = np.empty(QUAD * (4 + 2 * n_modes))
-    rays = np.empty(8 * QUAD * POINTS)
+    lane = np.empty(LANES * (1 + 2 * n_modes))
+    sums = np.empty(LANES * (4 + 2 * n_modes))
+    rays = np.empty(8 * LANES * POINTS)
     extremes = np.empty(2 * LANES, np.float32)
     places = np.empty(QUAD, np.int64)
     columns = np.empty((8 + 4 * n_modes) * QUAD)
-    cells = np.empty(BLOCK, np.int64)
-    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
+    cells = np.empty(n_cells if len(tension) > 0 else 0, np.int64)
+    count = 0
+    for block in range(n_blocks):
+        if not part * n_blocks <= block * n_parts < (part + 1) * n_blocks:
+            continue
         end = min(n_cells, (block + 1) * BLOCK)
         for begin in range(block * BLOCK, end, QUAD):
             write_records(state, radius, begin, end, modes, record, places, columns)
@@ -437,11 +354,9 @@ def contours(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, tor
             record[i, 3] = high + SLACK * mean + 0.125 * spacing * spacing * bend
             record[i, 4] = low - SLACK * mean
         if len(tension) > 0:
-            count = 0
-            for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
+            for i in range(block * BLOCK, end):
                 if record[i, 4] > 0.0:
                     cells[count] = i
                     count += 1
-            gradient_of_length(
-                cells, count, lane, sums, record, quarter, starts, modes, tangent, rays
-            )
+    if len(tension) > 0:
+        gradient_of_length(cells, count, lane, sums, record, quarter, starts, modes, tangent, rays)

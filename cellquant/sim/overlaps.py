@@ -12,12 +12,18 @@ import numpy as np
 from numba import njit
 
 from cellquant.sim.grazes import gap
-from cellquant.sim.lanes import QUAD, doubles, gather, load, store
-from cellquant.sim.outlines import BLOCK, HEAD
+from cellquant.sim.lanes import QUAD, doubles, gather, load, peek, poke, root, store
+from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import shared
+from cellquant.sim.records import HEAD
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
-SLOTS = 32  # crossings of a cell whose powers are summed at once; a multiple of 4
+ATAN = (  # of arctan(t) / t in powers of t^2, t < tan(pi / 8), to 4e-17
+    0.999999999999999965, -0.333333333333284341, 0.199999999988541675, -0.142857141809006454,
+    0.111111061773752269, -0.0909077300324082779, 0.0768995248823301616, -0.0664022517353950076,
+    0.0568830340363324983, -0.0434791983904653699, 0.0211337520337483632,
+)  # fmt: skip
+SLOTS = 32  # crossings of a cell whose powers are summed at once; even
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
@@ -29,26 +35,26 @@ def add_powers(side: Any, used: int, modes: Any, tile: Any) -> None:
     """
     n_powers = 2 * len(modes) + 3
     half = n_powers * QUAD
-    for slot in range(0, used, 4):
+    for slot in range(0, used, 2):
         p = slot * QUAD
         c_0, s_0, twice_0, before_c0, before_s0 = first_power(side, p)
         c_1, s_1, twice_1, before_c1, before_s1 = first_power(side, p + QUAD)
-        c_2, s_2, twice_2, before_c2, before_s2 = first_power(side, p + 2 * QUAD)
-        c_3, s_3, twice_3, before_c3, before_s3 = first_power(side, p + 3 * QUAD)
-        for n in range(1, n_powers):
+        for n in range(1, n_powers, 2):
             at = n * QUAD
-            store(tile, at, load(tile, at) + ((s_0 + s_1) + (s_2 + s_3)))
-            at += half
-            store(tile, at, load(tile, at) - ((c_0 + c_1) + (c_2 + c_3)))
-            c_0, before_c0 = twice_0 * c_0 - before_c0, c_0
-            s_0, before_s0 = twice_0 * s_0 - before_s0, s_0
-            c_1, before_c1 = twice_1 * c_1 - before_c1, c_1
-            s_1, before_s1 = twice_1 * s_1 - before_s1, s_1
-            c_2, before_c2 = twice_2 * c_2 - before_c2, c_2
-            s_2, before_s2 = twice_2 * s_2 - before_s2, s_2
-            c_3, before_c3 = twice_3 * c_3 - before_c3, c_3
-            s_3, before_s3 = twice_3 * s_3 - before_s3, s_3
-    for slot in range((used + 3) // 4 * 4):
+            store(tile, at, load(tile, at) + (s_0 + s_1))
+            store(tile, half + at, load(tile, half + at) - (c_0 + c_1))
+            before_c0 = twice_0 * c_0 - before_c0
+            before_s0 = twice_0 * s_0 - before_s0
+            before_c1 = twice_1 * c_1 - before_c1
+            before_s1 = twice_1 * s_1 - before_s1
+            at += QUAD
+            store(tile, at, load(tile, at) + (before_s0 + before_s1))
+            store(tile, half + at, load(tile, half + at) - (before_c0 + before_c1))
+            c_0 = twice_0 * before_c0 - c_0
+            s_0 = twice_0 * before_s0 - s_0
+            c_1 = twice_1 * before_c1 - c_1
+            s_1 = twice_1 * before_s1 - s_1
+    for slot in range((used + 1) // 2 * 2):
         store(side, slot * QUAD, doubles(0.0))
 
 
@@ -62,7 +68,19 @@ def first_power(side: Any, p: int) -> tuple[Any, Any, Any, Any, Any]:
     )  # fmt: skip
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
+def angle_of(cosine: Any, sine: Any) -> Any:
+    """Angle of unit vectors in the first quadrant, to round-off: four times that of a quarter."""
+    t = sine / (1.0 + cosine)
+    t = t / (1.0 + root(1.0 + t * t))
+    q = t * t
+    total = q * ATAN[10] + ATAN[9]
+    for n in range(8, -1, -1):
+        total = total * q + ATAN[n]
+    return 4.0 * t * total
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def fill_lanes(record: Any, tangent: Any, rows: Any, modes: Any, tension: Any, lane: Any) -> None:
     """Put what the shape forces of a tile of cells need side by side.
 
@@ -93,7 +111,7 @@ def fill_lanes(record: Any, tangent: Any, rows: Any, modes: Any, tension: Any, l
             store(lane, at + 3 * QUAD, v3)
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def shape_forces(
     tile: Any, lane: Any, inverse: Any, k: float, eta: float, modes: Any, tension: Any, out: Any
 ) -> None:
@@ -184,8 +202,11 @@ def exact_velocity(
     rows = np.empty(2 * QUAD, np.int64)
     out = np.empty((1 + 2 * n_modes) * QUAD)
     lens = np.empty(QUAD)
+    rest = np.zeros(2 * QUAD)
     side = np.zeros(3 * SLOTS * QUAD)
-    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
+    for block in range(n_blocks):
+        if not part * n_blocks <= block * n_parts < (part + 1) * n_blocks:
+            continue
         end = min(n_cells, (block + 1) * BLOCK)
         for begin in range(block * BLOCK, end, QUAD):
             tile[:] = 0.0
@@ -212,48 +233,53 @@ def exact_velocity(
                     if own:
                         p = first[i] + entry
                     else:
-                        p = back_pair[back_first[i] + entry - n_own]
-                    if inside[p] == (1 if own else 2):
+                        p = peek(back_pair, back_first[i] + entry - n_own)
+                    if peek(inside, p) == (1 if own else 2):
                         whole += 2.0 * math.pi
-                    if root_first[p] == root_last[p]:
+                    if peek(root_first, p) == peek(root_last, p):
                         continue
                     arc_r = 1.0
                     arc_i = 0.0
-                    for r in range(root_first[p], root_last[p]):
+                    for r in range(peek(root_first, p), peek(root_last, p)):
+                        at = r * roots.shape[1]
                         if own:
-                            s = sign[r]
-                            c1 = roots[r, 0]
-                            s1 = roots[r, 1]
-                            distance = roots[r, 4]
-                            turned = c1 * roots[r, 3] - s1 * roots[r, 2]
-                            shared -= 0.5 * s * distance * roots[r, 5] * turned
+                            s = peek(sign, r)
+                            c1 = peek(roots, at)
+                            s1 = peek(roots, at + 1)
+                            distance = peek(roots, at + 4)
+                            turned = c1 * peek(roots, at + 3) - s1 * peek(roots, at + 2)
+                            shared -= 0.5 * s * distance * peek(roots, at + 5) * turned
                         else:
-                            s = -sign[r]
-                            c1 = roots[r, 2]
-                            s1 = roots[r, 3]
-                            distance = roots[r, 5]
-                        fx += s * distance * s1
-                        fy -= s * distance * c1
-                        spin += 0.5 * s * distance * distance
-                        arc_r, arc_i = arc_r * c1 - s * arc_i * s1, arc_i * c1 + s * arc_r * s1
+                            s = -peek(sign, r)
+                            c1 = peek(roots, at + 2)
+                            s1 = peek(roots, at + 3)
+                            distance = peek(roots, at + 5)
+                        push = s * distance
+                        fx += push * s1
+                        fy -= push * c1
+                        spin += 0.5 * push * distance
+                        turned = s * s1
+                        arc_r, arc_i = arc_r * c1 - arc_i * turned, arc_i * c1 + arc_r * turned
                         if filled == SLOTS:
                             add_powers(side, SLOTS, modes, tile)
                             filled = 0
                             used = 0
-                        side[filled * QUAD + column] = s
-                        side[(SLOTS + filled) * QUAD + column] = c1
-                        side[(2 * SLOTS + filled) * QUAD + column] = s1
+                        poke(side, filled * QUAD + column, s)
+                        poke(side, (SLOTS + filled) * QUAD + column, c1)
+                        poke(side, (2 * SLOTS + filled) * QUAD + column, s1)
                         filled += 1
                     if arc_r > 0.0 and arc_i >= 0.0:
-                        # Short arcs are turned together; their sum is below pi.
+                        # Short arcs are added by turning one by the other, quarter turns apart.
                         arcs_r, arcs_i = (
                             arcs_r * arc_r - arcs_i * arc_i,
                             arcs_r * arc_i + arcs_i * arc_r,
                         )
-                        if arcs_r <= 0.0:
-                            whole += math.atan2(arcs_i, arcs_r)
-                            arcs_r = 1.0
-                            arcs_i = 0.0
+                        over = arcs_r <= 0.0
+                        whole += 0.5 * math.pi if over else 0.0
+                        arcs_r, arcs_i = (
+                            (arcs_i if over else arcs_r),
+                            (-arcs_r if over else arcs_i),
+                        )
                         continue
                     angle = math.atan2(arc_i, arc_r)
                     if angle < 0.0:
@@ -276,12 +302,15 @@ def exact_velocity(
                             if g <= 0.0:
                                 angle = 0.0
                     whole += angle
-                tile[column] = whole + math.atan2(arcs_i, arcs_r)
+                tile[column] = whole
+                rest[column] = arcs_r
+                rest[QUAD + column] = arcs_i
                 used = max(used, filled)
                 velocity[i, 0] = v0 * record[i, 5] - mu_r * k * fx
                 velocity[i, 1] = v0 * record[i, 6] - mu_r * k * fy
                 velocity[i, 2] = mu_theta * k * spin if len(torque) > 0 else 0.0
                 lens[column] = shared
+            store(tile, 0, load(tile, 0) + angle_of(load(rest, 0), load(rest, QUAD)))
             if used > 0:
                 add_powers(side, used, modes, tile)
             shape_forces(tile, lane, inverse, k, eta, modes, tension, out)

@@ -62,6 +62,12 @@ def _call(_: Any, address: Any, arguments: Any) -> Any:
 call: Any = intrinsic(_call)
 
 
+@njit(cache=True)
+def alone(address: int, arrays: Any, modes: Any, tension: Any, torque: Any) -> None:
+    """Do the work at `address` (see `Shared`) in one part, which costs no start of threads."""
+    call(address, (0, 1, arrays, modes, tension, torque))
+
+
 @njit(cache=True, parallel=True)
 def share(address: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any) -> None:
     """Do the work at `address` (see `Shared`), `n_parts` parts side by side."""

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from cellquant.sim.crossings import ROOT
-from cellquant.sim.outlines import HEAD
+from cellquant.sim.records import HEAD
 
 NARROW = 0.3  # radius over R0 below which the contour's length needs more points, and the
 # crossings are sought on this contour: its own radius varies fast with the direction

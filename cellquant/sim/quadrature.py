@@ -7,8 +7,9 @@ import numpy as np
 from numba import njit
 
 from cellquant.sim.lanes import LANES
-from cellquant.sim.outlines import BLOCK, HEAD
+from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import shared
+from cellquant.sim.records import HEAD
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 
@@ -64,7 +65,9 @@ def sample_contours(
     odd = np.zeros(half)
     even_slope = np.zeros(half)
     odd_slope = np.zeros(half)
-    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
+    for block in range(n_blocks):
+        if not part * n_blocks <= block * n_parts < (part + 1) * n_blocks:
+            continue
         for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
             r0 = radius[i]
             power = 0.0
@@ -147,7 +150,9 @@ def quadrature_velocity(
     odd = np.empty(half)
     even_slope = np.empty(half)
     odd_slope = np.empty(half)
-    for block in range(part * n_blocks // n_parts, (part + 1) * n_blocks // n_parts):
+    for block in range(n_blocks):
+        if not part * n_blocks <= block * n_parts < (part + 1) * n_blocks:
+            continue
         for i in range(block * BLOCK, min(n_cells, (block + 1) * BLOCK)):
             for s in range(size):
                 held[s] = 0.0

@@ -34,7 +34,7 @@ from cellquant.sim.lanes import (
     scatter,
     store,
 )
-from cellquant.sim.outlines import HEAD
+from cellquant.sim.records import HEAD
 
 Floats = NDArray[np.float64]
 CG_TOLERANCE = 1e-2
