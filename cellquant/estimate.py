@@ -172,7 +172,7 @@ def _pilot(scene: SceneConfig, options: dict[str, Any]) -> tuple[float, float]:
         started = time.process_time()
         run(PILOT_TIME, min(1.0, scene.save_every or 1.0))
         between = time.process_time()
-        observe(few.to_tracks(), **options)
+        observe(few, **options)
         simulated.append(between - started)
         observed.append(time.process_time() - between)
     return min(simulated) / PILOT_TIME, min(observed) / (few.n_frames * scene.cells)

@@ -200,7 +200,7 @@ def open_source(
     if source.is_dir() and (source / "zarr.json").is_file():
         from cellquant.sim import open_run
 
-        return open_run(source).to_tracks(columns=columns_read(only))
+        return open_run(source).scan(columns=columns_read(only))
     if source.is_dir() and (source / "tracks.parquet").is_file():
         if shapes_only and (source / "cells.parquet").is_file():
             return scan_cells(source, columns=columns_read(only, of_cells=True))

@@ -93,7 +93,7 @@ def _simulate_and_observe(task: Task, folder: Path) -> None:
     record = RunRecord("sweep", settings)
     with record.stage("simulate"):
         run = simulate_scene(scene, folder / "run.zarr")
-    observe_into(run.to_tracks(), folder, record, options=task["observables"])
+    observe_into(run, folder, record, options=task["observables"])
     record.write(folder)
 
 

@@ -93,7 +93,7 @@ def test_a_run_through_the_same_code(tmp_path: Path) -> None:
     tracks = brownian(np.random.default_rng(1), 100, 80, diffusion=0.004, box=(10.0, 10.0))
 
     class Run:
-        def to_tracks(self, columns: list[str]) -> Tracks:
+        def scan(self, columns: list[str]) -> Tracks:
             return replace(tracks, table=tracks.table[columns])
 
     observed = observe(Run())

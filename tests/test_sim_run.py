@@ -12,9 +12,11 @@ import pytest
 
 from cellquant.errors import InputError
 from cellquant.observables import observe
+from cellquant.pipeline import observe_source
 from cellquant.sim import Scene, SimulationFailure, open_run, simulate
 from cellquant.sim import run as run_module
 from cellquant.sim.noise import BrownianTree
+from cellquant.sim.rows import RunRows
 from cellquant.tables import REDUCED, TRACK_COLUMNS
 
 SMALL = Scene(n_cells=9, phi=0.9)
@@ -191,6 +193,21 @@ def test_tracks_carry_the_true_contours():
         pd.testing.assert_frame_equal(part, table[part.columns])
 
 
+def test_a_run_in_pieces_gives_the_bytes_of_its_table(monkeypatch, tmp_path):
+    path = tmp_path / "run.zarr"
+    run = simulate(Scene(n_cells=23), duration=10, dt=0.1, save_every=0.25, output=path)
+    observe(run.to_tracks()).write(tmp_path / "table")
+    frames = [slice(start, min(start + 7, 41)) for start in range(0, 41, 7)]
+    monkeypatch.setattr("cellquant.sim.archive.Run.stretches", lambda run: iter(frames))
+    monkeypatch.setattr("cellquant.rows.PIECE", 100)
+    pieces = [set(p["track_id"].tolist()) for p in RunRows(run).pieces("x")]
+    assert len(pieces) > 8
+    assert sum(map(len, pieces)) == 23
+    observe_source(path, tmp_path / "pieces")
+    for file in (tmp_path / "table").iterdir():
+        assert file.read_bytes() == (tmp_path / "pieces" / file.name).read_bytes(), file.name
+
+
 @pytest.mark.parametrize("only", [["msd"], ["density", "structure_factor"]])
 def test_motion_of_a_run_measures_no_contour(only, monkeypatch):
     run = simulate(Scene(n_cells=16), duration=2, dt=0.02)
@@ -199,8 +216,8 @@ def test_motion_of_a_run_measures_no_contour(only, monkeypatch):
     def refuse(*args):
         raise AssertionError("a contour was measured that no output shows")
 
-    monkeypatch.setattr("cellquant.sim.archive.measure_shapes", refuse)
-    monkeypatch.setattr("cellquant.sim.archive.Run._count_neighbours", refuse)
+    monkeypatch.setattr("cellquant.sim.rows.measure_shapes", refuse)
+    monkeypatch.setattr("cellquant.sim.archive.Run.count_neighbours", refuse)
     assert observe(run, only=only).summary == expected.summary
     with pytest.raises(AssertionError, match="no output shows"):
         observe(run, only=["shape_index"])

@@ -159,7 +159,7 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
     Parameters
     ----------
     source
-        `Tracks`; anything with a ``to_tracks(columns=...)`` method, such as a run; or `Cells`, from
+        `Tracks`; anything with a ``scan(columns=...)`` method, such as a run; or `Cells`, from
         which only what needs no trajectories is measured. Tracks and cells may stay on disk
         (`cellquant.rows.scan_tracks`, `scan_cells`): they are read in pieces and never held whole.
     only
@@ -210,12 +210,12 @@ def observe(source: Any, *, only: Sequence[str] | None = None, **options: Any) -
     if isinstance(only, str):
         raise InputError(f"only must be a list of names, got {only!r}; write only=[{only!r}].")
     if not isinstance(source, (Tracks, Cells, Scan)):
-        if not hasattr(source, "to_tracks"):
+        if not hasattr(source, "scan"):
             raise InputError(
                 f"observables are measured from tracks, cells or a run, got "
                 f"{type(source).__name__}; open the source first."
             )
-        source = source.to_tracks(columns=columns_read(only))
+        source = source.scan(columns=columns_read(only))
     wanted = _wanted(source.head if isinstance(source, Scan) else source, only)
     settings = checked_settings(options)
     context = Context(source, settings, wanted)

@@ -2,8 +2,8 @@
 
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from cellquant import __version__
 from cellquant.errors import InputError
 from cellquant.io.runstore import check_run_store, read_arrays
+from cellquant.sim.rows import RunRows, RunScan
 from cellquant.sim.scene import Scene
-from cellquant.sim.shapes import measure_shapes, shape_indices
+from cellquant.sim.shapes import shape_indices
 from cellquant.storage import atomic_path
 from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
 
 Floats = NDArray[np.float64]
 CHECKPOINT = "checkpoint.npz"
-_SHAPE_COLUMNS = ("perimeter", "shape_index", "aspect_ratio", "orientation")
 _LARGEST = 1e300  # number in the description of a run
 CHUNK = 262_144  # numbers of a chunk: what one write of a growing run touches
 
@@ -229,7 +229,7 @@ class Run:
     @cached_property
     def time(self) -> Floats:
         """(T,) time of the frames since the end of the transient, t0."""
-        times = self._read("time", slice(None))
+        times = self.read("time", slice(None))
         return times[: int(np.argmax(np.isnan(times)))] if np.isnan(times).any() else times
 
     @property
@@ -250,12 +250,12 @@ class Run:
     @cached_property
     def radius(self) -> Floats:
         """(N,) radii R0_i, L0."""
-        return self._read("radius", slice(None))
+        return self.read("radius", slice(None))
 
     @cached_property
     def box(self) -> tuple[float, float]:
         """Edges of the periodic box, L0."""
-        edges = self._read("box", slice(None))
+        edges = self.read("box", slice(None))
         return float(edges[0]), float(edges[1])
 
     @property
@@ -263,7 +263,14 @@ class Run:
         """Packing fraction sum(pi R0_i^2) / (Lx Ly)."""
         return float(np.sum(math.pi * self.radius**2)) / (self.box[0] * self.box[1])
 
-    def _read(self, name: str, where: slice | int) -> Floats:
+    def read(self, name: str, where: slice | int) -> Floats:
+        """Frames of an array, or all of what does not change.
+
+        Raises
+        ------
+        InputError
+            If they cannot be decoded or are not all there.
+        """
         try:
             values = np.asarray(self._group[name][where], np.float64)
         except Exception as error:  # whatever a decoder calls it
@@ -281,19 +288,30 @@ class Run:
         return values
 
     def _frames(self, name: str) -> Floats:
-        return self._read(name, slice(self.n_frames))
+        return self.read(name, slice(self.n_frames))
 
     def state(self, frame: int) -> Floats:
         """State rows x, y, theta, a_2 .. a_M, b_2 .. b_M of one frame."""
         frame = range(self.n_frames)[frame]
-        modes = self._read("modes", frame)
-        polarity = self._read("polarity", frame)
-        position = self._read("position", frame)
+        modes = self.read("modes", frame)
+        polarity = self.read("polarity", frame)
+        position = self.read("position", frame)
         return np.column_stack([position, polarity, modes.reshape(len(modes), -1)])
+
+    def stretches(self) -> Iterator[slice]:
+        """Successive frames that lie together on disk, all frames in turn."""
+        size = int(self._group["modes"].chunks[0])
+        for start in range(0, self.n_frames, size):
+            yield slice(start, min(start + size, self.n_frames))
 
     def mean_shape_index(self) -> Floats:
         """(T,) mean over the cells of p = P / sqrt(A), from the true contours."""
-        return np.array([shape_indices(modes).mean() for modes in self.modes])
+        means = [
+            shape_indices(modes).mean()
+            for frames in self.stretches()
+            for modes in self.read("modes", frames)
+        ]
+        return np.array(means)
 
     def stationarity(self, n_blocks: int = 5, *, start: int = 0) -> Stationarity:
         """Test whether <p> still drifts: the halves of the run against their block errors.
@@ -332,59 +350,52 @@ class Run:
         InputError
             If the run holds no frame.
         """
-        wanted = [name for name in TRACK_COLUMNS if columns is None or name in columns]
-        n_cells, n_frames = len(self.radius), self.n_frames
-        if n_frames == 0:
+        scan = self.scan(columns=columns)
+        assert isinstance(scan.head, Tracks)
+        names = list(scan.head.table.columns)
+        pieces = list(RunRows(self).pieces(*names))
+        table = pd.DataFrame({k: np.concatenate([piece.pop(k) for piece in pieces]) for k in names})
+        return replace(scan.head, table=table)
+
+    def scan(self, *, columns: Sequence[str] | None = None) -> RunScan:
+        """The run as tracks that are made a few cells at a time, without holding the table.
+
+        Parameters
+        ----------
+        columns
+            As in `to_tracks`.
+
+        Raises
+        ------
+        InputError
+            If the run holds no frame.
+        """
+        if self.n_frames == 0:
             raise InputError(f"{self.path or 'the run'} holds no frame yet; simulate for longer.")
-        # One row per cell and frame, all frames of the first cell first.
-        label = np.repeat(np.arange(1, n_cells + 1), n_frames)
-        series: dict[str, Any] = {
-            "frame": np.tile(np.arange(n_frames), n_cells),
-            "label": label,
-            "area": np.repeat(math.pi * self.radius**2, n_frames),
-            "touches_border": np.zeros(len(label), bool),
-            "track_id": label,
-            "parent_track_id": np.zeros(len(label), np.int64),
-            "time": np.tile(self.time, n_cells),
-        }
-        if {"x", "y"} & set(wanted):
-            position = self.position
-            series["x"], series["y"] = position[:, :, 0].T.ravel(), position[:, :, 1].T.ravel()
-        if "n_neighbours" in wanted:
-            series["n_neighbours"] = self._count_neighbours().T.ravel()
+        wanted = [name for name in TRACK_COLUMNS if columns is None or name in columns]
         provenance: dict[str, Any] = {
             "source": "simulation",
             "scene": self.scene.to_dict(),
             "settings": self.settings,
             "status": self.status,
         }
-        shapes = [name for name in _SHAPE_COLUMNS if name in wanted]
-        if shapes:
-            modes, polarity = self.modes, self.polarity
-            measured = np.empty((len(shapes), n_cells, n_frames))
-            for t in range(n_frames):
-                table = measure_shapes(modes[t], polarity[t], self.radius)
-                measured[:, :, t] = table[shapes].to_numpy().T
-            series.update(zip(shapes, measured.reshape(len(shapes), -1), strict=True))
-            if "shape_index" in shapes:
-                means = measured[shapes.index("shape_index")].mean(axis=0)
-                try:
-                    provenance["stationarity"] = asdict(_compare_halves(means, 5))
-                except InputError as error:
-                    provenance["stationarity"] = {"stationary": None, "reason": str(error)}
-        table = pd.DataFrame({name: series[name] for name in wanted}).astype(
-            {name: TRACK_COLUMNS[name] for name in wanted}
-        )
-        return Tracks(
-            table=table,
+        if "shape_index" in wanted:
+            try:
+                provenance["stationarity"] = asdict(self.stationarity())
+            except InputError as error:
+                provenance["stationarity"] = {"stationary": None, "reason": str(error)}
+        head = Tracks(
+            table=pd.DataFrame({name: np.empty(0, TRACK_COLUMNS[name]) for name in wanted}),
             units=REDUCED,
             frame_interval=float(self.settings["save_every"]),
             area=self.box[0] * self.box[1],
             box=self.box,
             provenance=provenance,
         )
+        return RunScan(head, self.path or Path("run"), self)
 
-    def _count_neighbours(self) -> NDArray[np.int64]:
+    def count_neighbours(self) -> NDArray[np.int64]:
+        """(T, N) number of cells whose contours each cell overlaps."""
         from cellquant.sim.contacts import Layer
 
         layer = Layer(self.scene, self.radius, np.array(self.box))

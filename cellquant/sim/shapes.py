@@ -7,6 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+_BATCH = 256  # contours at a time: their points stay in the cache
 
 
 def contour_radii(
@@ -90,21 +91,20 @@ def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFr
         moments), orientation (of the long axis, radians in (-pi/2, pi/2]), offset_x and offset_y
         of the centre of mass from the centre of the contour.
     """
+    n = np.arange(2, modes.shape[2] + 2)
     points = 32 * max(6, modes.shape[2] + 1)
-    rho, slope = contour_radii(modes, polarity, radius, points)
-    angle = 2.0 * math.pi * np.arange(points) / points
-    c, s = np.cos(angle), np.sin(angle)
-    d = 2.0 * math.pi / points
-    perimeter = d * np.sqrt(rho**2 + slope**2).sum(axis=1)
-    area = 0.5 * d * (rho**2).sum(axis=1)
-    x = d / 3.0 * (rho**3 @ c) / area
-    y = d / 3.0 * (rho**3 @ s) / area
-    xx = 0.25 * d * (rho**4 @ c**2) / area - x * x
-    yy = 0.25 * d * (rho**4 @ s**2) / area - y * y
-    xy = 0.25 * d * (rho**4 @ (c * s)) / area - x * y
+    angle = 2.0 * math.pi * np.outer(n, np.arange(points)) / points
+    waves = np.cos(angle), np.sin(angle)
+    parts = [
+        _moments(modes[start : start + _BATCH], n, waves) for start in range(0, len(radius), _BATCH)
+    ]
+    length, square, x, y, xx, yy, xy = np.concatenate(parts or [np.empty((0, 7))]).T
+    # In the frame of the polarity and in units of R0 so far.
+    area, perimeter = square * radius**2, length * radius
+    c, s = np.cos(polarity), np.sin(polarity)
     spread = np.hypot(0.5 * (xx - yy), xy)
-    orientation = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    orientation[orientation <= -0.5 * math.pi] += math.pi
+    orientation = polarity + 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    orientation -= math.pi * np.ceil(orientation / math.pi - 0.5)
     half = 0.5 * (xx + yy)
     return pd.DataFrame(
         {
@@ -113,7 +113,31 @@ def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFr
             "shape_index": perimeter / np.sqrt(area),
             "aspect_ratio": np.sqrt((half + spread) / (half - spread)),
             "orientation": orientation,
-            "offset_x": x,
-            "offset_y": y,
+            "offset_x": radius * (c * x - s * y),
+            "offset_y": radius * (s * x + c * y),
         }
     )
+
+
+def _moments(modes: Floats, n: Floats, waves: tuple[Floats, Floats]) -> Floats:
+    """(N, 7) perimeter, area, centre of mass and second moments of contours with R0 = 1.
+
+    Term by term instead of matrix products, whose last digits depend on the cells beside.
+    """
+    even, odd = waves
+    a, b = modes[:, 0, :, None], modes[:, 1, :, None]
+    rho = np.repeat(np.sqrt(1.0 - 0.5 * np.sum(modes**2, axis=(1, 2)))[:, None], even.shape[1], 1)
+    slope = np.zeros_like(rho)
+    for k, order in enumerate(n):
+        rho += a[:, k] * even[k] + b[:, k] * odd[k]
+        slope += (order * b[:, k]) * even[k] - (order * a[:, k]) * odd[k]
+    angle = 2.0 * math.pi * np.arange(even.shape[1]) / even.shape[1]
+    c, s = np.cos(angle), np.sin(angle)
+    d = angle[1]
+    square = rho * rho
+    area = 0.5 * d * square.sum(axis=1)
+    length = d * np.sqrt(square + slope * slope).sum(axis=1)
+    cube, fourth = rho * square, square * square
+    x, y = (d / 3.0 * (cube * wave).sum(axis=1) / area for wave in (c, s))
+    xx, yy, xy = (0.25 * d * (fourth * w).sum(axis=1) / area for w in (c * c, s * s, c * s))
+    return np.column_stack([length, area, x, y, xx - x * x, yy - y * y, xy - x * y])
