@@ -5,6 +5,7 @@ the other; of tracks a piece holds whole tracks, in the order of track and frame
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -67,6 +68,11 @@ class Rows:
     """
 
     linked: bool
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        raise NotImplementedError
 
     def _stretches(self, names: list[str]) -> Iterator[Piece]:
         """Rows of the source as they lie there, by column."""
@@ -139,6 +145,11 @@ class TableRows(Rows):
         self._table = source.table
         self.linked = isinstance(source, Tracks)
 
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self._table)
+
     def _stretches(self, names: list[str]) -> Iterator[Piece]:
         columns = {name: self._table[name] for name in names}
         for start in range(0, len(self._table), PIECE):
@@ -154,19 +165,32 @@ class FileRows(Rows):
     def __init__(self, path: Path, linked: bool) -> None:
         self._path, self.linked = path, linked
 
-    def _stretches(self, names: list[str]) -> Iterator[Piece]:
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        with self._readable(), pq.ParquetFile(self._path) as file:
+            return int(file.metadata.num_rows)
+
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
         try:
-            # Without a buffer of its own each column of a row group would be held in its packed
-            # form as a whole.
-            with pq.ParquetFile(self._path, buffer_size=2**16, pre_buffer=False) as file:
-                for batch in file.iter_batches(PIECE, columns=names, use_threads=False):
-                    yield {name: self._array(name, batch.column(name)) for name in names}
+            yield
         except (pa.ArrowException, OSError) as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0][:300]
             raise InputError(
                 f"{self._path} is not a readable parquet table ({reason}); make it again from its "
                 "source."
             ) from error
+
+    def _stretches(self, names: list[str]) -> Iterator[Piece]:
+        # Without a buffer of its own each column of a row group would be held in its packed form
+        # as a whole.
+        with (
+            self._readable(),
+            pq.ParquetFile(self._path, buffer_size=2**16, pre_buffer=False) as file,
+        ):
+            for batch in file.iter_batches(PIECE, columns=names, use_threads=False):
+                yield {name: self._array(name, batch.column(name)) for name in names}
 
     def _array(self, name: str, column: Any) -> Any:
         kind = TRACK_COLUMNS[name]

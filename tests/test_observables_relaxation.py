@@ -40,6 +40,19 @@ def test_lags_without_data_are_passed_over() -> None:
     assert crossing_time(time, value) == pytest.approx(2.0)
 
 
+def test_the_bias_of_a_noisy_curve_is_told_not_taken_off() -> None:
+    time = np.arange(1.0, 24.0)
+    exact = relaxation_time(curve(np.exp(-time / 8), time))
+    assert exact.value == pytest.approx(8.0)
+    assert exact.bias == pytest.approx(0, abs=1e-12)
+    noisy = relaxation_time(curve(np.exp(-time / 8), time, 0.05))
+    assert noisy.value == pytest.approx(8.0)
+    # Half the second derivative of the crossing by F, times the squared error of F.
+    error, step = 0.05 * np.linspace(-1.5, 1.5, 9).std(ddof=1) / 3, 1e-4
+    low, mid, high = (crossing_time(time, np.exp(-time / 8) + d) for d in (-step, 0.0, step))
+    assert noisy.bias == pytest.approx(0.5 * (low - 2 * mid + high) / step**2 * error**2, rel=0.01)
+
+
 def test_censored_where_it_stays_above() -> None:
     time = np.arange(1.0, 24.0)
     found = relaxation_time(curve(np.exp(-time / 100), time))

@@ -6,6 +6,7 @@ from scipy import stats
 
 from cellquant.observables import observe
 from cellquant.observables.blocks import Blocks, spatial_blocks
+from cellquant.observables.ranks import at_ranks
 from cellquant.observables.shape import describe
 from observables_examples import tracks_of
 
@@ -54,6 +55,22 @@ def test_mode_of_a_skewed_law_within_its_error() -> None:
     assert errors.mean() == pytest.approx(modes.std(), rel=0.15)
     # Student's quantile of 95 % with 15 degrees of freedom; the jackknife holds 0.85 of them.
     assert np.mean(abs(modes - modes.mean()) < 2.13 * errors) >= 0.9
+
+
+def test_ranks_of_several_sorted_arrays_are_those_of_all_values() -> None:
+    rng = np.random.default_rng(7)
+    for values in (
+        rng.normal(0, 1, 300),
+        rng.integers(-3, 4, 300) * 0.5,
+        np.array([-1e308, -0.0, 0.0, 5e-324, 1e308] * 60),
+        np.zeros(300),
+    ):
+        parts = [np.sort(part) for part in np.split(values, [7, 120, 121])]
+        everyone = np.sort(values)
+        found = at_ranks(parts, np.arange(300), np.full(300, -1))
+        np.testing.assert_array_equal(found, everyone)
+        rest = np.sort(np.r_[values[:7], values[120:]])
+        np.testing.assert_array_equal(at_ranks(parts, np.arange(187), np.full(187, 1)), rest)
 
 
 def test_constant_values_and_no_values() -> None:

@@ -127,8 +127,16 @@ class Context:
 
     @cached_property
     def unsmoothed_paths(self) -> "Trajectories":
-        """The retained tracks, drift removed, not smoothed."""
+        """The retained tracks, drift removed, not smoothed; the smoothed ones are let go."""
+        if self._as_smoothed:
+            return self.paths
+        self.__dict__.pop("paths", None)
         return self._trajectories()
+
+    @property
+    def _as_smoothed(self) -> bool:
+        """Whether smoothing changes nothing."""
+        return self.tracks.smoothing != 1 or self.smoothing == 1
 
     @property
     def smoothed_over(self) -> int:
@@ -140,10 +148,8 @@ class Context:
         """The retained tracks, drift removed, smoothed unless the source came smoothed."""
         from cellquant.observables.smoothing import smooth
 
-        if self.tracks.smoothing != 1 or self.smoothing == 1:
-            return self.unsmoothed_paths
-        if "van_hove" in self.wanted:  # which asks for the others too
-            return smooth(self.unsmoothed_paths, self.smoothing)
+        if self._as_smoothed:
+            return self._trajectories()
         return smooth(self._trajectories(), self.smoothing, overwrite=True)
 
     @cached_property

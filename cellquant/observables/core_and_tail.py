@@ -14,6 +14,7 @@ CORE_REACH = 1.5  # the core ends at this many standard deviations
 TAIL_EXCESS = 10.0  # the tail begins where it holds this many times what the core predicts
 GAUSSIAN_TAIL = 3.0  # where it never does, at this many standard deviations: 1.1 % of a Gaussian
 MIN_COUNT = 30
+_STRIDE = 256
 STANDS_OUT = f"from where it holds {TAIL_EXCESS:g} times what the core predicts"
 END_OF_CORE = (
     f"from {GAUSSIAN_TAIL:g} standard deviations of one component of the core, beyond which "
@@ -68,9 +69,11 @@ class Tail(NamedTuple):
 
 @dataclass(frozen=True)
 class _Lengths:
-    """Sorted lengths with their running sums, so that a range costs two searches.
+    """Increasing lengths with their running sums, so that a range costs two searches.
 
-    Those of one block may be taken as absent: ``gone`` holds them, ``place`` where they stand.
+    ``first`` and ``second`` are the sums of the lengths and of their squares before every
+    `_STRIDE`-th. Those of one block may be taken as absent: ``gone`` holds them, ``place`` where
+    they stand.
     """
 
     r: FloatArray
@@ -81,7 +84,16 @@ class _Lengths:
 
     @classmethod
     def of(cls, r: FloatArray) -> "_Lengths":
-        return cls(r, np.r_[0.0, np.cumsum(r)], np.r_[0.0, np.cumsum(r * r)])
+        pieces = [r[start : start + _STRIDE] for start in range(0, r.size, _STRIDE)]
+        sums = np.array([(piece.sum(), (piece * piece).sum()) for piece in pieces]).reshape(-1, 2)
+        first, second = np.vstack([np.zeros(2), np.cumsum(sums, axis=0)]).T
+        return cls(r, first, second)
+
+    def _before(self, rank: int) -> tuple[float, float]:
+        """Sums of the lengths and of their squares of the first so many."""
+        k = rank // _STRIDE
+        rest = self.r[k * _STRIDE : rank]
+        return float(self.first[k] + rest.sum()), float(self.second[k] + (rest * rest).sum())
 
     def without(self, place: IntArray) -> "_Lengths":
         """The same without the lengths that stand at these places."""
@@ -107,8 +119,8 @@ class _Lengths:
     def between(self, low: float, high: float) -> tuple[int, float, float]:
         """Number of lengths in [low, high], their sum, and the sum of their squares."""
         a, b = np.searchsorted(self.r, low), np.searchsorted(self.r, high, side="right")
-        n, one = int(b - a), float(self.first[b] - self.first[a])
-        two = float(self.second[b] - self.second[a])
+        above, below = self._before(int(b)), self._before(int(a))
+        n, one, two = int(b - a), above[0] - below[0], above[1] - below[1]
         if self.gone:
             less = self.gone.between(low, high)
             return n - less[0], one - less[1], two - less[2]
@@ -132,7 +144,7 @@ def fit_core_and_tail(
     Parameters
     ----------
     r
-        (n,) lengths, some above zero.
+        (n,) increasing lengths, some above zero.
     block
         (n,) replicate block of each length.
     n_blocks
@@ -158,10 +170,7 @@ def fit_core_and_tail(
         The core, with fewer than 30 lengths in its range or when they do not fall off; the tail
         likewise.
     """
-    order = np.argsort(r, kind="stable")
-    block = block[order]
-    lengths = _Lengths.of(r[order])
-    del order
+    lengths = _Lengths.of(r)
     core, tail = _fit(lengths, core_range, tail_range)
     present = np.flatnonzero(np.bincount(block, minlength=n_blocks))
     if present.size < 2:

@@ -40,12 +40,16 @@ def displacements(
 
 def lengths(paths: Trajectories, lag: int, blocks: Blocks) -> tuple[FloatArray, IntArray]:
     """Lengths of all displacements over a lag, and the block of each, range of tracks by range."""
-    found, block = [np.empty(0)], [np.empty(0, dtype=np.int16)]
+    # As large as may be needed: what is never filled in takes no memory.
+    found = np.empty(paths.x.size)
+    block: Any = np.empty(paths.x.size, dtype=np.int16)
+    n = 0
     for first, last in paths.spans():
         dx, dy, track, _ = displacements(paths, lag, first=first, last=last)
-        found.append(np.hypot(dx, dy))
-        block.append(blocks.index[track].astype(np.int16))
-    return np.concatenate(found), np.concatenate(block)
+        found[n : n + dx.size] = np.hypot(dx, dy)
+        block[n : n + dx.size] = blocks.index[track]
+        n += dx.size
+    return found[:n], block[:n]
 
 
 def speeds(paths: Trajectories) -> tuple[FloatArray, Blocks]:

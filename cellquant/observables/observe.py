@@ -49,7 +49,6 @@ _CATALOGUE: dict[str, _Entry] = {
     ),
     "overlap": _Entry("self-overlap Q(t)", True, measures.overlap),
     "chi4": _Entry("four-point susceptibility", True, measures.chi4),
-    "van_hove": _Entry("G_s(r, t) with core and tail", True, fields.van_hove),
     "velocity_autocorrelation": _Entry(
         "<v(s) . v(s + t)> and the persistence time", True, fields.velocity_autocorrelation
     ),
@@ -57,6 +56,8 @@ _CATALOGUE: dict[str, _Entry] = {
         "<v_i . v_j> against distance", True, fields.velocity_correlation
     ),
     "cage_relative": _Entry("MSD and F_s relative to the neighbours", True, fields.cage_relative),
+    # The last of motion: it alone needs trajectories that are not smoothed.
+    "van_hove": _Entry("G_s(r, t) with core and tail", True, fields.van_hove),
     "structure_factor": _Entry("S(q) and its first peak", False, fields.structure_factor),
     "pair_correlation": _Entry("g(r)", False, fields.pair_correlation),
     "hexatic_order": _Entry("psi_6", False, fields.hexatic_order),

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cellquant.observables.blocks import leave_one_out
 from cellquant.observables.dynamics import LagAverage
 from cellquant.observables.trajectories import FloatArray
 
@@ -30,6 +31,10 @@ class RelaxationTime:
         Share of resamples that do not cross.
     reason
         Why a value or an error is missing; None when nothing is.
+    bias
+        By how much the value is expected to be too long, as the jackknife over blocks tells: the
+        crossing is a convex function of a noisy curve. Not taken off. None where a curve without
+        one of the blocks does not cross.
     """
 
     value: float | None
@@ -39,6 +44,7 @@ class RelaxationTime:
     below: float | None
     censored_fraction: float
     reason: str | None
+    bias: float | None = None
 
 
 def crossing_time(lag_time: FloatArray, value: FloatArray, threshold: float = THRESHOLD) -> float:
@@ -147,11 +153,22 @@ def relaxation_time(
         None if low95 is None else max(tau - widen * (tau - low95), 0.0),
         None if high95 is None else tau + widen * (high95 - tau),
     )
+    bias = _bias(average, threshold, tau)
     if low68 is None or high68 is None:
         reason = f"{censored:.0%} of the bootstrap resamples do not cross, so the error is open"
-        return RelaxationTime(tau, None, interval, None, None, censored, reason)
+        return RelaxationTime(tau, None, interval, None, None, censored, reason, bias)
     error = float(widen * (high68 - low68) / 2)
-    return RelaxationTime(tau, error, interval, None, None, censored, None)
+    return RelaxationTime(tau, error, interval, None, None, censored, None, bias)
+
+
+def _bias(average: LagAverage, threshold: float, tau: float) -> float | None:
+    """(B - 1) (mean of the crossing times without each block - that with all)."""
+    used = average.counts.sum(axis=1) > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curves = leave_one_out(average.sums[used]) / leave_one_out(average.counts[used])
+    times = [crossing_time(average.lag_time, curve, threshold) for curve in curves]
+    bias = (len(times) - 1) * (float(np.mean(times)) - tau)
+    return bias if np.isfinite(bias) else None
 
 
 def _bootstrap(average: LagAverage, threshold: float, n: int, seed: int) -> FloatArray:

@@ -81,6 +81,7 @@ def time_entry(tau: Any) -> dict[str, Any]:
         "value": tau.value,
         "std_error": tau.std_error,
         "interval_95": list(tau.interval),
+        "bias": tau.bias,
         "censored_at": tau.censored_at,
         "censored_fraction": tau.censored_fraction,
     }

@@ -1,6 +1,6 @@
 """Distribution of the shape of cells, pooled over frames."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from cellquant.observables.blocks import Blocks, jackknife_error, spatial_blocks
+from cellquant.observables.ranks import at_ranks
 from cellquant.observables.trajectories import FloatArray, IntArray
 from cellquant.rows import Piece, Scan, rows_of
 from cellquant.tables import Cells, Tracks
@@ -87,12 +88,16 @@ def pooled(
     rows, head = rows_of(source), source.head if isinstance(source, Scan) else source
     box = head.box if isinstance(head, Tracks) else None
     names = tuple(dict.fromkeys((*columns, "x", "y")))
-    values, centres, items = [np.empty(0)], [np.empty((0, 2))], [np.empty(0, dtype=np.int32)]
-    n_items = 0
+    # As large as may be needed: what is never filled in takes no memory.
+    values = np.empty(rows.size)
+    items = np.empty(rows.size if rows.linked else 0, dtype=np.int32)
+    centres = [np.empty((0, 2))]
+    n = n_items = 0
     for piece in rows.pieces(*names):
         used, found = value(piece)
         place = np.column_stack([piece["x"][used], piece["y"][used]])
-        values.append(found)
+        values[n : n + found.size] = found
+        n += found.size
         if not rows.linked:
             centres.append(place)
             continue
@@ -101,15 +106,14 @@ def pooled(
         size = np.maximum(np.bincount(row[known], minlength=track.size), 1)
         sums = [np.bincount(row[known], weights=v, minlength=track.size) for v in place[known].T]
         centres.append(np.column_stack(sums) / size[:, None])
-        items.append((n_items + row).astype(np.int32))
+        items[n - row.size : n] = n_items + row
         n_items += track.size
-    centre = np.concatenate(centres)
-    blocks = spatial_blocks(np.nan_to_num(centre), box=box)
+    blocks = spatial_blocks(np.nan_to_num(np.concatenate(centres)), box=box)
     if not rows.linked:
         method = blocks.method.replace("tracks", "cells")
-        return np.concatenate(values), Blocks(blocks.index, blocks.n, method)
-    index = blocks.index.astype(np.int16)[np.concatenate(items)]
-    return np.concatenate(values), Blocks(index, blocks.n, blocks.method)
+        return values[:n], Blocks(blocks.index, blocks.n, method)
+    index = blocks.index.astype(np.int16)[items[:n]]
+    return values[:n], Blocks(index, blocks.n, blocks.method)
 
 
 def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distribution:
@@ -143,28 +147,22 @@ def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distri
     """
     if values.size == 0:
         return Distribution({**dict.fromkeys(_DESCRIPTORS), "std_error": None, "n": 0}, _empty())
-    order = np.argsort(blocks.index, kind="stable")
-    sizes = np.bincount(blocks.index, minlength=blocks.n)
-    parts = np.split(values[order], np.cumsum(sizes)[:-1])
+    parts = [np.sort(values[blocks.index == block]) for block in range(blocks.n)]
     parts = [part for part in parts if part.size]
-    del order
-    bandwidth = _bandwidth(values)
+    n = int(values.size)
+    centre = float(sum(part.sum() for part in parts)) / n
+    powers = np.array([[np.sum((p - centre) ** k) for k in range(4)] for p in parts])
+    levels = (0.05, 0.25, 0.5, 0.75, 0.95)
+    quantiles = _quantiles(parts, levels)
+    bandwidth = _bandwidth(parts, powers.sum(axis=0), quantiles[3] - quantiles[1])
     grid, counts = _fine_counts(parts, bandwidth)
     smooth = _smooth(counts.sum(axis=0), grid, bandwidth)
-    centre = float(values.mean())
-    powers = np.array([[np.sum((p - centre) ** k) for k in range(4)] for p in parts])
-    whole = _descriptors(powers.sum(axis=0), centre, float(np.median(values)), _peak(grid, smooth))
+    whole = _descriptors(powers.sum(axis=0), centre, quantiles[2], _peak(grid, smooth))
     summary: dict[str, Any] = dict(whole)
     if len(parts) >= 2:
-        medians = _medians_without(values, blocks.index)
         rest = [
-            _descriptors(
-                powers.sum(axis=0) - powers[b],
-                centre,
-                medians[b],
-                float("nan"),
-            )
-            for b in range(len(parts))
+            _descriptors(powers.sum(axis=0) - gone, centre, median, float("nan"))
+            for gone, median in zip(powers, _medians_without(parts), strict=True)
         ]
         replicates = np.array([[r[k] for k in _DESCRIPTORS] for r in rest])
         errors = dict(zip(_DESCRIPTORS, jackknife_error(replicates).tolist(), strict=True))
@@ -177,13 +175,8 @@ def describe(values: FloatArray, blocks: Blocks, *, n_bins: int = 100) -> Distri
     summary["std_error"] = errors["mean"]
     summary["mode_std_error_method"] = f"{MODE_RESAMPLINGS} resamplings of the blocks"
     summary.update({f"{k}_std_error": v for k, v in errors.items() if k != "mean"})
-    quantiles = (0.05, 0.25, 0.5, 0.75, 0.95)
-    summary["quantiles"] = dict(
-        zip(map(str, quantiles), np.quantile(values, quantiles).tolist(), strict=True)
-    )
-    summary.update(
-        n=int(values.size), bandwidth=bandwidth, std_error_method=blocks.method, n_blocks=len(parts)
-    )
+    summary["quantiles"] = dict(zip(map(str, levels), quantiles, strict=True))
+    summary.update(n=n, bandwidth=bandwidth, std_error_method=blocks.method, n_blocks=len(parts))
     return Distribution(summary, _histogram(parts, grid, smooth, n_bins))
 
 
@@ -197,13 +190,13 @@ def _empty() -> pd.DataFrame:
     )
 
 
-def _bandwidth(values: FloatArray) -> float:
-    low, high = np.quantile(values, (0.25, 0.75))
-    spread = float(np.std(values))
-    if not spread > 1e-12 * float(np.abs(values).max()):
+def _bandwidth(parts: list[FloatArray], powers: FloatArray, quartiles: float) -> float:
+    n = float(powers[0])
+    spread = float(np.sqrt(max(powers[2] / n - (powers[1] / n) ** 2, 0.0)))
+    if not spread > 1e-12 * max(float(np.abs(p[[0, -1]]).max()) for p in parts):
         return 0.0  # equal but for round-off
-    robust = min(spread, float(high - low) / 1.349) or spread
-    return float(0.9 * robust * values.size ** (-0.2))
+    robust = min(spread, quartiles / 1.349) or spread
+    return float(0.9 * robust * n ** (-0.2))
 
 
 def _descriptors(powers: FloatArray, centre: float, median: float, mode: float) -> dict[str, float]:
@@ -222,19 +215,21 @@ def _descriptors(powers: FloatArray, centre: float, median: float, mode: float) 
     }
 
 
-def _medians_without(values: FloatArray, block: IntArray) -> list[float]:
-    """Median of all values without each block that has any, from one common sort."""
-    order = np.argsort(values, kind="stable")
-    values, block = values[order], block[order]
-    del order
-    medians = []
-    for left_out in np.unique(block):
-        gone = np.flatnonzero(block == left_out)
-        kept_before = gone - np.arange(gone.size)  # values kept that are smaller
-        size = values.size - gone.size
-        ranks = np.array([(size - 1) // 2, size // 2])
-        places = ranks + np.searchsorted(kept_before, ranks, side="right")
-        medians.append(0.5 * float(values[places[0]] + values[places[1]]))
+def _quantiles(parts: list[FloatArray], levels: Sequence[float]) -> list[float]:
+    """Quantiles of sorted parts together, interpolated linearly between ranks."""
+    place = np.array(levels) * (sum(p.size for p in parts) - 1)
+    low = np.floor(place).astype(np.int64)
+    found = at_ranks(parts, np.r_[low, np.ceil(place).astype(np.int64)], np.full(2 * low.size, -1))
+    below, above = found[: low.size], found[low.size :]
+    quantiles: list[float] = (below + (place - low) * (above - below)).tolist()
+    return quantiles
+
+
+def _medians_without(parts: list[FloatArray]) -> list[float]:
+    """Median of sorted parts together, without each in turn."""
+    left = sum(p.size for p in parts) - np.array([p.size for p in parts])
+    found = at_ranks(parts, np.r_[(left - 1) // 2, left // 2], np.tile(np.arange(len(parts)), 2))
+    medians: list[float] = (0.5 * (found[: len(parts)] + found[len(parts) :])).tolist()
     return medians
 
 

@@ -102,6 +102,9 @@ def self_van_hove(
     blocks = spatial_blocks(paths.centre, box=paths.box)
     r, block = lengths(paths, lag, blocks)
     r /= unit
+    order = np.argsort(r, kind="stable")
+    r, block = r[order], block[order]
+    del order
     fits: dict[str, Any] = {
         "n": int(r.size),
         "sigma2": None, "sigma2_std_error": None, "component_variance": None,
@@ -112,16 +115,18 @@ def self_van_hove(
     core, tail = None, None
     if r.size == 0:
         fits["reason"] = "no track has two points that far apart in time"
-    elif not r.max() > 0:
+    elif not r[-1] > 0:
         fits["reason"] = "no cell moved"
     else:
         fitted = fit_core_and_tail(r, block, blocks.n, core_range=core_range, tail_range=tail_range)
-        fits.update(_describe(*fitted, longest=float(r.max())))
+        fits.update(_describe(*fitted, longest=float(r[-1])))
         core = fitted[0] if fitted[0].reason is None else None
         tail = fitted[2] if fitted[2].reason is None else None
-    table = _histogram(r, block, blocks.n, core, tail)
+    squares = sum(float((part * part).sum()) for part in _stretches(r))
+    spread = float(np.sqrt(squares / max(r.size, 1) / 2))
+    sigma2 = core.sigma2 if core is not None else 2 * spread**2
+    table = _histogram(r, block, blocks.n, sigma2, core, tail)
     _goodness(table, fits)
-    spread = float(np.sqrt(np.mean(r * r) / 2)) if r.size else 0.0
     return VanHove(table, _components(paths, lag, unit, blocks, spread), fits)
 
 
@@ -154,22 +159,28 @@ def _describe(
 
 
 def _histogram(
-    r: FloatArray, block: IntArray, n: int, core: Core | None, tail: Tail | None
+    r: FloatArray,
+    block: IntArray,
+    n: int,
+    sigma2: float,
+    core: Core | None,
+    tail: Tail | None,
 ) -> pd.DataFrame:
     """Rings a fifth of a component's width wide (at most 400), both normalisations and fits."""
     names = (
         "r", "value", "std_error", "unit_integral", "unit_integral_std_error", "gaussian",
         "exponential",
     )  # fmt: skip
-    if r.size == 0 or not r.max() > 0:
+    if r.size == 0 or not r[-1] > 0:
         return pd.DataFrame({**{k: np.empty(0) for k in names}, "n": np.empty(0, np.int64)})
-    sigma2 = core.sigma2 if core is not None else float(np.mean(r * r))
-    n_bins = int(np.clip(np.ceil(r.max() / (0.2 * np.sqrt(sigma2 / 2))), 10, 400))
-    edges = np.linspace(0, float(r.max()), n_bins + 1)
+    longest = float(r[-1])
+    n_bins = int(np.clip(np.ceil(longest / (0.2 * np.sqrt(sigma2 / 2))), 10, 400))
+    edges = np.linspace(0, longest, n_bins + 1)
     width = edges[1]
-    ring = np.minimum((r / width).astype(np.int64), n_bins - 1)
     hits = np.zeros((n, n_bins))
-    np.add.at(hits, (block, ring), 1.0)
+    for part, members in zip(_stretches(r), _stretches(block), strict=True):
+        ring = np.minimum((part / width).astype(np.int64), n_bins - 1)
+        np.add.at(hits, (members, ring), 1.0)
     size = hits.sum(axis=1)
     centre = 0.5 * (edges[1:] + edges[:-1])
     areas = np.pi * np.diff(edges**2)
@@ -200,12 +211,17 @@ def _histogram(
         level = core.beyond(0.0) / r.size / (np.pi * sigma2)
         table["gaussian"] = level * np.exp(-(centre**2) / sigma2)
     if tail is not None:
-        xi, low, high = tail.xi, tail.low, min(tail.high, float(r.max()))
+        xi, low, high = tail.xi, tail.low, min(tail.high, longest)
         mass = xi * ((low + xi) - (high + xi) * np.exp((low - high) / xi))
         level = (tail.n - tail.n_core) / r.size / (2 * np.pi * mass)
         # Only from where the tail begins: the fit says nothing about smaller r.
         table["exponential"] = np.where(centre >= low, level * np.exp((low - centre) / xi), np.nan)
     return table
+
+
+def _stretches(values: Any) -> list[Any]:
+    """Views of an array, a few values at a time."""
+    return [values[start : start + 2**15] for start in range(0, len(values), 2**15)]
 
 
 def _goodness(table: pd.DataFrame, fits: dict[str, Any]) -> None:

@@ -54,6 +54,11 @@ class RunRows(Rows):
     def __init__(self, run: "Run") -> None:
         self._run = run
 
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self._run.radius) * self._run.n_frames
+
     @cached_property
     def _in_order(self) -> bool:
         return True
