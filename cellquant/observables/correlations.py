@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 from scipy.special import j0
 
 from cellquant.observables.blocks import (
@@ -18,6 +17,7 @@ from cellquant.observables.blocks import (
 from cellquant.observables.bonds import neighbour_pairs
 from cellquant.observables.dynamics import LagAverage
 from cellquant.observables.motion import displacements
+from cellquant.observables.pairs import pairs_within
 from cellquant.observables.trajectories import FloatArray, IntArray, Trajectories, log_lags
 
 
@@ -211,18 +211,14 @@ def velocity_correlation(
         np.add.at(square[:, 0], blocks.index[track], dx**2 + dy**2)
         np.add.at(square[:, 1], blocks.index[track], 1.0)
         place = _places(paths, track, entry)
-        tree = cKDTree(place, boxsize=paths.box)
-        pairs = tree.query_pairs(max_distance, output_type="ndarray")
-        delta = place[pairs[:, 0]] - place[pairs[:, 1]]
-        if paths.box is not None:
-            delta -= np.array(paths.box) * np.round(delta / np.array(paths.box))
-        ring = np.searchsorted(edges, np.hypot(delta[:, 0], delta[:, 1]), side="right") - 1
-        ring = np.minimum(ring, n_bins - 1)
-        product = dx[pairs[:, 0]] * dx[pairs[:, 1]] + dy[pairs[:, 0]] * dy[pairs[:, 1]]
-        for side in (0, 1):
-            place_of = (blocks.index[track[pairs[:, side]]], ring)
-            np.add.at(sums, place_of, 0.5 * product)
-            np.add.at(counts, place_of, 0.5)
+        block = blocks.index[track]
+        for first, second, distance in pairs_within(place, max_distance, paths.box):
+            ring = np.searchsorted(edges, distance, side="right") - 1
+            ring = np.minimum(ring, n_bins - 1)
+            product = dx[first] * dx[second] + dy[first] * dy[second]
+            for one in (first, second):
+                np.add.at(sums, (block[one], ring), 0.5 * product)
+                np.add.at(counts, (block[one], ring), 0.5)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = sums.sum(axis=0) / counts.sum(axis=0) * square[:, 1].sum() / square[:, 0].sum()
         speed2 = leave_one_out(square[:, 1]) / leave_one_out(square[:, 0])

@@ -1,5 +1,6 @@
 """Pair correlation of the cell centres."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 from cellquant.observables.blocks import jackknife_error, leave_one_out, ratio_with_error
 from cellquant.observables.layer import Layer, blocks_of, layer_of, positions_by_frame
 from cellquant.observables.region import Region
-from cellquant.observables.trajectories import FloatArray
+from cellquant.observables.trajectories import FloatArray, IntArray
 from cellquant.rows import Scan
 from cellquant.tables import Cells, Tracks
 
@@ -91,16 +92,15 @@ def pair_correlation(
     reach = min(max_distance or 5 * d, 0.5 * float(layer.edges.min()))
     n_bins = max(int(np.floor(reach / (bin_width or d / 20))), 1)
     edges = np.linspace(0, reach, n_bins + 1)
-    blocks = blocks_of(layer)
+    blocks, box = blocks_of(layer), layer.edges if layer.periodic else None
     found, expected_pairs = np.zeros((blocks.n, n_bins)), np.zeros((blocks.n, n_bins))
     for rows, place, region in frames:
-        tree = cKDTree(place, boxsize=layer.edges if layer.periodic else None)
-        pairs = tree.query_pairs(reach, output_type="ndarray")
-        gap = _gap(place[pairs[:, 0]], place[pairs[:, 1]], layer)
-        ring = np.minimum(np.searchsorted(edges, gap, side="right") - 1, n_bins - 1)
-        for side in (0, 1):
-            np.add.at(found, (blocks.index[rows[pairs[:, side]]], ring), 0.5)
-        members = np.bincount(blocks.index[rows], minlength=blocks.n)
+        block = blocks.index[rows]
+        for first, second, gap in pairs_within(place, reach, box):
+            ring = np.minimum(np.searchsorted(edges, gap, side="right") - 1, n_bins - 1)
+            for one in (first, second):
+                np.add.at(found, (block[one], ring), 0.5)
+        members = np.bincount(block, minlength=blocks.n)
         expected_pairs += np.outer(0.5 * (len(rows) - 1) * members, _share(layer, region, edges))
     value, error = ratio_with_error(found, expected_pairs)
     distance = 0.5 * (edges[1:] + edges[:-1])
@@ -181,9 +181,23 @@ def _highest(
     }
 
 
-def _gap(first: FloatArray, second: FloatArray, layer: Layer) -> FloatArray:
-    delta = first - second
-    if layer.periodic:
-        delta -= layer.edges * np.round(delta / layer.edges)
-    gap: FloatArray = np.hypot(delta[:, 0], delta[:, 1])
-    return gap
+def pairs_within(
+    place: FloatArray, reach: float, box: Any = None
+) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
+    """Pairs of positions up to a distance, each once: first, second and distance, in pieces.
+
+    Parameters
+    ----------
+    place
+        (n, 2) positions, inside the box where there is one.
+    reach
+        Largest distance.
+    box
+        Edges of a periodic box, or None.
+    """
+    everyone = cKDTree(place, boxsize=box)
+    for start in range(0, len(place), 256):
+        some = cKDTree(place[start : start + 256], boxsize=box)
+        near = some.sparse_distance_matrix(everyone, reach, output_type="ndarray")
+        near = near[near["j"] > near["i"] + start]
+        yield near["i"] + start, near["j"], near["v"]

@@ -96,9 +96,11 @@ def structure_factor(
     half = (q > 0) & (q <= limit) & ~((q_x[:, None] == 0) & (q_y[None, :] < 0))
     shells = _Shells.of(q[half], float(step.max()))
     for place in frames:
-        wave_x = np.exp(-1j * np.outer(q_x, place[:, 0]))
-        wave_y = np.exp(-1j * np.outer(place[:, 1], q_y))
-        shells.add((np.abs(wave_x @ wave_y) ** 2 / len(place))[half])
+        wave = np.zeros(q.shape, dtype=np.complex128)
+        for start in range(0, len(place), 256):
+            x, y = place[start : start + 256].T
+            wave += np.exp(-1j * np.outer(q_x, x)) @ np.exp(-1j * np.outer(y, q_y))
+        shells.add((np.abs(wave) ** 2 / len(place))[half])
     return _summarise(shells, scale)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -102,9 +103,7 @@ def self_van_hove(
     blocks = spatial_blocks(paths.centre, box=paths.box)
     r, block = lengths(paths, lag, blocks)
     r /= unit
-    order = np.argsort(r, kind="stable")
-    r, block = r[order], block[order]
-    del order
+    r, block = _in_order(r, block)
     fits: dict[str, Any] = {
         "n": int(r.size),
         "sigma2": None, "sigma2_std_error": None, "component_variance": None,
@@ -217,6 +216,19 @@ def _histogram(
         # Only from where the tail begins: the fit says nothing about smaller r.
         table["exponential"] = np.where(centre >= low, level * np.exp((low - centre) / xi), np.nan)
     return table
+
+
+def _in_order(r: FloatArray, block: IntArray) -> tuple[FloatArray, IntArray]:
+    """Lengths and their blocks by length, sorted slice by slice to hold one order at a time."""
+    cuts = np.sort(r[::1024])[::64]
+    sorted_r, sorted_block = np.empty_like(r), np.empty_like(block)
+    n = 0
+    for low, high in pairwise((-np.inf, *cuts, np.inf)):
+        inside = np.flatnonzero((r >= low) & (r < high))
+        inside = inside[np.argsort(r[inside], kind="stable")]
+        sorted_r[n : n + inside.size], sorted_block[n : n + inside.size] = r[inside], block[inside]
+        n += inside.size
+    return sorted_r, sorted_block
 
 
 def _stretches(values: Any) -> list[Any]:
