@@ -290,9 +290,27 @@ def test_extreme_input_gives_an_answer_or_a_reason(case: str, tmp_path: Path) ->
     if case in {"one frame", "two frames", "shorter than a window", "no rows"}:
         assert summary["tau_alpha"]["value"] is None
         assert "consecutive points" in summary["tau_alpha"]["reason"] or case == "no rows"
+    if case in {"all still", "all on one spot", "all alike"}:
+        assert summary["speed"]["mean"] == 0.0
+        for name in ("msd", "velocity_autocorrelation", "velocity_correlation"):
+            assert summary[name]["reason"] == "no cell moved"
+    if case == "ballistic":
+        assert summary["velocity_autocorrelation"]["persistence_time"] is None
+        assert "does not decay" in summary["velocity_autocorrelation"]["reason"]
+        assert summary["msd"]["exponent"] == pytest.approx(2)
+    if case in {"one track", "all on one spot"}:
+        assert "four cells in view" in summary["cage_relative"]["reason"]
     if case == "one track":
         assert summary["msd"]["diffusion_coefficient_std_error"] is None
+        assert "two replicate blocks" in summary["msd"]["std_error_reason"]
         assert summary["processing"]["drift_removed"] is False
+
+
+def test_smoothing_makes_no_peak_of_the_non_gaussian_parameter() -> None:
+    peak = observe(movie(np.random.default_rng(14)), only=["alpha2"]).summary["alpha2_peak"]
+    assert peak["lag_time"] >= 50
+    assert peak["shortest_lag"] == 5
+    assert abs(peak["value"]) < 3.5 * peak["std_error"]
 
 
 def test_positions_that_are_not_numbers_count_as_missing() -> None:

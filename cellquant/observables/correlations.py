@@ -80,10 +80,14 @@ def persistence_time(correlation: LagAverage, *, first_lag: int, interval: float
     -------
     dict
         persistence_time with std_error and fit_range; None with a reason when fewer than two
-        lags qualify or the correlation does not decay.
+        lags qualify or the correlation does not decay by more than two standard errors.
     """
     value, error = ratio_with_error(correlation.sums, correlation.counts)
     found: dict[str, Any] = {"persistence_time": None, "persistence_time_std_error": None}
+    if not (value > 0).any():
+        moved = bool((correlation.sums != 0).any())
+        reason = "the velocity correlation is nowhere above zero" if moved else "no cell moved"
+        return {**found, "reason": reason}
     after = np.flatnonzero(correlation.lag_time >= (first_lag - 1e-9) * interval)
     good = []
     for k in after:
@@ -96,24 +100,28 @@ def persistence_time(correlation: LagAverage, *, first_lag: int, interval: float
     time = correlation.lag_time[good]
     centred = time - time.mean()
 
-    def decay(curve: FloatArray) -> FloatArray:
+    def rate(curve: FloatArray) -> FloatArray:
         with np.errstate(invalid="ignore", divide="ignore"):
-            rate: FloatArray = -1 / (
-                (np.log(curve[..., good]) * centred).sum(-1) / (centred**2).sum()
-            )
-        return rate
+            slope: FloatArray = (np.log(curve[..., good]) * centred).sum(-1) / (centred**2).sum()
+        return -slope
 
-    best = float(decay(value))
-    if not best > 0:
-        return {**found, "reason": "the velocity correlation does not decay"}
     with np.errstate(invalid="ignore", divide="ignore"):
-        rest = leave_one_out(correlation.sums) / leave_one_out(correlation.counts)
-    return {
-        "persistence_time": best,
-        "persistence_time_std_error": float(jackknife_error(decay(rest))),
+        rest = rate(leave_one_out(correlation.sums) / leave_one_out(correlation.counts))
+    best, scatter = float(rate(value)), float(jackknife_error(rest))
+    if not best * (time[-1] - time[0]) > 1e-6 or best < 2 * scatter:
+        reason = f"the velocity correlation does not decay beyond its error up to {time[-1]:g}"
+        return {**found, "reason": reason}
+    std_error = float(jackknife_error(1 / rest)) if (rest > 0).all() else float("nan")
+    entry: dict[str, Any] = {
+        "persistence_time": 1 / best,
+        "persistence_time_std_error": std_error,
         "fit_range": [float(time[0]), float(time[-1])],
         "std_error_method": correlation.method,
     }
+    if not np.isfinite(std_error):
+        few = "the error needs at least two replicate blocks, and a decay without each of them"
+        entry["std_error_reason"] = few
+    return entry
 
 
 def _origins(paths: Trajectories, max_frames: int) -> IntArray:

@@ -165,6 +165,10 @@ def cage_relative(context: Context, out: Results) -> None:
     table.insert(3, "msd", msd["value"])
     table.insert(4, "msd_std_error", msd["std_error"])
     out.tables["cage_relative"] = table
+    if not wave.counts.any():
+        reason = "no cell keeps a neighbour: fewer than four cells in view, or all on a line"
+        out.summary["cage_relative"] = {"tau_alpha": None, "reason": reason}
+        return
     out.summary["cage_relative"] = {
         "tau_alpha": time_entry(relaxation_time(wave)),
         "n_origins": n_origins,

@@ -139,10 +139,10 @@ def msd(context: Context, out: Results) -> None:
     }
 
 
-def _peak(table: pd.DataFrame, method: str) -> dict[str, Any]:
-    """Largest value of a curve, and whether it lies inside the measured range."""
+def _peak(table: pd.DataFrame, method: str, *, first: float = 0.0) -> dict[str, Any]:
+    """Largest value of a curve from a lag on, and whether it lies inside the measured range."""
     value = table["value"].to_numpy()
-    known = np.flatnonzero(np.isfinite(value))
+    known = np.flatnonzero(np.isfinite(value) & (table["lag_time"].to_numpy() >= first))
     if known.size == 0:
         return {
             "value": None, "lag_time": None, "std_error": None,
@@ -158,6 +158,8 @@ def _peak(table: pd.DataFrame, method: str) -> dict[str, Any]:
         "at_edge": at_edge,
         "std_error_method": method,
     }
+    if not np.isfinite(found["std_error"]):
+        found["std_error_reason"] = "the error needs at least two replicate blocks"
     if at_edge:
         found["note"] = "the largest value is at an end of the measured lags: perhaps not a peak"
     return found
@@ -172,7 +174,11 @@ def alpha2(context: Context, out: Results) -> None:
         return
     table = alpha2_table(*context.moments)
     out.tables["alpha2"] = table
-    out.summary["alpha2_peak"] = _peak(table, context.moments[0].method)
+    # A moving average shrinks towards the ends of a track: over shorter lags the displacements
+    # there are larger than the others, which alone makes alpha_2 positive.
+    first = (context.smoothed_over - 0.5) * context.tracks.frame_interval
+    peak = _peak(table, context.moments[0].method, first=first if context.smoothed_over > 1 else 0)
+    out.summary["alpha2_peak"] = {**peak, "shortest_lag": context.smoothed_over}
 
 
 def _overlap_cutoff(context: Context) -> float | None:

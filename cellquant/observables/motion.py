@@ -111,10 +111,13 @@ def growth_exponent(second: LagAverage) -> dict[str, Any]:
         fit(leave_one_out(second.sums), leave_one_out(second.counts)),
         np.repeat(second.counts[:, fitted].sum(axis=1)[:, None], 2, axis=1),
     )
-    return {
+    entry = {
         "exponent": whole[0],
         "exponent_std_error": error[0],
         "diffusion_coefficient": whole[1],
         "diffusion_coefficient_std_error": error[1],
         "fit_range": span,
     }
+    if not np.isfinite(error).all():
+        entry["std_error_reason"] = "the error needs at least two replicate blocks"
+    return entry

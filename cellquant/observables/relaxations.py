@@ -151,7 +151,7 @@ def windows(context: Context, out: Results) -> None:
 
 def _why_no_window(context: Context, entries: list[dict[str, Any]]) -> str:
     """Why no window gives a relaxation time."""
-    reasons = list(dict.fromkeys(e["reason"] for e in entries if e.get("reason")))
+    reasons = list(dict.fromkeys(e["reason"] for e in entries if "n_pairs" not in e))
     return "; ".join(reasons) or context.no_bin or "no window has a relaxation time"
 
 

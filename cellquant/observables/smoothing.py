@@ -14,6 +14,8 @@ from cellquant.tables import Tracks
 # With n cells the drift estimate carries 1/n of every cell's own motion; below this many cells
 # common to two frames it would be motion, not drift, that is taken away.
 MIN_DRIFT_CELLS = 8
+# Relative error of a position from which a sum of steps has been subtracted, at most.
+ROUND_OFF = 64 * float(np.finfo(float).eps)
 # Frames per position beyond which tracks are gaps and little else.
 MAX_GAPS = 1000
 
@@ -213,10 +215,13 @@ def trajectories_of(
         before += int(new.sum())
         used = kept[index]
         index, frame, x, y = number[index[used]], frame[used], x[used], y[used]
-        if found.present.size:
-            moved = found.shift[:, np.searchsorted(found.present, frame)]
-            x, y = x - moved[0], y - moved[1]
-        layout.add(index, frame, x, y)
+        if not found.present.size:
+            layout.add(index, frame, x, y)
+            continue
+        moved = found.shift[:, np.searchsorted(found.present, frame)]
+        # What is left of cells that move with the others only is round-off, and no motion.
+        noise = [ROUND_OFF * (np.abs(v) + np.abs(m)) for v, m in zip((x, y), moved, strict=True)]
+        layout.add(index, frame, x - moved[0], y - moved[1], noise=noise)
     return layout.trajectories(frame_interval=head.frame_interval, box=head.box)
 
 

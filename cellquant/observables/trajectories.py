@@ -1,6 +1,6 @@
 """Trajectories as arrays: one stretch per track, a frame without a position marked as missing."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,8 +126,19 @@ class Layout:
         self.valid = np.zeros(size, dtype=bool)
         self.start, self.centre = np.zeros((first.size, 2)), np.zeros((first.size, 2))
 
-    def add(self, track: IntArray, frame: IntArray, x: FloatArray, y: FloatArray) -> None:
-        """Fill in whole tracks, given by their number, in the order of track and frame."""
+    def add(
+        self,
+        track: IntArray,
+        frame: IntArray,
+        x: FloatArray,
+        y: FloatArray,
+        *,
+        noise: Sequence[FloatArray] = (),
+    ) -> None:
+        """Fill in whole tracks, given by their number, in the order of track and frame.
+
+        A distance from the first position up to the noise of both, where it is given, is none.
+        """
         starts = np.flatnonzero(np.diff(track, prepend=-1))
         if not starts.size:
             return
@@ -136,7 +147,10 @@ class Layout:
         entry = self.offsets[track] + frame - self.first[track]
         self.valid[entry] = True
         for axis, (values, target) in enumerate(((x, self.x), (y, self.y))):
-            target[entry] = values - values[starts][row]
+            away = values - values[starts][row]
+            if noise:
+                away[np.abs(away) <= noise[axis] + noise[axis][starts][row]] = 0.0
+            target[entry] = away
             self.start[number, axis] = values[starts]
             self.centre[number, axis] = np.bincount(row, weights=values) / size
 
