@@ -68,8 +68,8 @@ def write_run(path: Path, n_cells: int, n_frames: int) -> None:
     """The same walkers as a run; only the file is that of a simulation."""
     rng = np.random.default_rng(1)
     scene = Scene(n_cells=n_cells)
-    settings = dict.fromkeys(("contact", "integrator"), "none")
-    settings |= {"points": 0, "dt": 1.0, "save_every": 1.0, "transient": 0.0, "duration": n_frames}
+    settings = {"contact": "exact", "points": None, "integrator": "euler", "dt": 1.0}
+    settings |= {"tolerance": None, "save_every": 1.0, "transient": 0.0, "duration": n_frames}
     group = create_group(path, scene, settings)
     edge = float(np.sqrt(n_cells))
     write_constants(group, np.full(n_cells, 0.5), np.array([edge, edge]))
