@@ -18,7 +18,12 @@ _PRIOR_LINKS = 10.0
 _FIT_LINKS = 10000  # links that a fit looks at, evenly taken
 _PRIOR_FLOW = 0.5  # neighbours that the first guess of the flow counts for
 _FIT_ROUNDS, _FIT_ENOUGH = 12, 1e-3  # until the scale changes by less than this share
+_COUNTED = 0.02  # probability from which a candidate counts in a fit
 _PRIOR_SCALE = 0.15  # of the spacing
+_CAUTION = 1.0  # of log likelihood per cell that a wider start may lose
+_FIRST_SCALES = np.geomspace(0.03, 2.0, 24)  # of the spacing
+_FIRST_CELLS = 5000
+_STRAY = 0.1
 _DOUBT = 12.0  # of log odds; no shape is compared that could not come so near the likeliest link
 
 
@@ -147,28 +152,58 @@ def expected_steps(movie: Movie, paths: Paths, motion: Motion, *, own_path: bool
     return expected
 
 
-def first_motion(movie: Movie) -> Motion:
-    """The motion model before anything is known: neighbours move alike."""
+def first_motion(movie: Movie, flow: FloatArray, candidates: IntArray) -> Motion:
+    """The motion model before anything is linked: neighbours move alike.
+
+    The scatter around the flow is the widest that is not clearly less likely than the likeliest,
+    if one of the candidates (N, K) of each cell follows the flow and the others lie anywhere: a
+    narrow start trusts the shortest links, and would find that they are short.
+    """
     spacing = float(np.median(movie.spacing))
     coefficients = np.zeros((KINDS, TERMS))
     coefficients[:, 0] = 0.5
     coefficients[:, 1] = 0.5
-    scale, tail = np.full(KINDS, _PRIOR_SCALE * spacing), np.full(KINDS, 4.0)
+    source = np.flatnonzero(candidates[:, 0] >= 0)
+    source = source[:: max(1, len(source) // _FIRST_CELLS)]
+    target = candidates[source]
+    away = movie.position[target] - (movie.position[source] + flow[source])[:, None]
+    square = np.where(target >= 0, np.sum(away**2, axis=2), np.inf)
+    likelihood = []
+    for scale in (_FIRST_SCALES * spacing).tolist():
+        density = (1.0 + square / (4.0 * scale**2)) ** -3 / (2.0 * np.pi * scale**2)
+        odds = density.sum(axis=1) / movie.density[source]
+        likelihood.append(float(np.mean(np.log(_STRAY + (1.0 - _STRAY) * odds))))
+    likely = np.array(likelihood) >= max(likelihood) - _CAUTION
+    first = max(float(_FIRST_SCALES[likely][-1]), _PRIOR_SCALE) * spacing
+    scale, tail = np.full(KINDS, first), np.full(KINDS, 4.0)
     return Motion(coefficients, scale, tail, np.ones(movie.n_cells))
 
 
-def fit_motion(movie: Movie, links: Links, paths: Paths, before: Motion) -> Motion:
-    """Fit prediction and scatter to the links, robustly, each kind of path by itself."""
-    source = np.flatnonzero((links.after >= 0) & (links.second < 0))
-    source = source[:: max(1, len(source) // _FIT_LINKS)]
-    target = links.after[source]
+def fit_motion(
+    movie: Movie,
+    links: Links,
+    candidates: IntArray,
+    probability: FloatArray,
+    paths: Paths,
+    before: Motion,
+) -> Motion:
+    """Fit prediction and scatter to the links, robustly, each kind of path by itself.
+
+    The other candidates (N, K) of a linked cell count by their probability: links that were
+    chosen because they are short would make steps look shorter than they are.
+    """
+    row = np.flatnonzero((links.after >= 0) & (links.second < 0))
+    row = row[:: max(1, len(row) // _FIT_LINKS)]
+    chance = probability[row]
+    which, slot = np.nonzero(chance > _COUNTED)
+    source, weight = row[which], chance[which, slot]
+    target = candidates[source, slot]
     frames = movie.frame_index[source]
     elapsed = movie.elapsed[source]
     step = movie.position[target] - movie.position[source]
     y = step / elapsed[:, None] - paths.drift[frames]
     x = regressors(paths, source, target)
     # A cell's own link is part of the neighbourhood of its neighbours only, never of its own.
-    weight = links.confidence[target]
     # Residuals grow as the root of time; in these units all have the same scatter.
     unit = 1.0 / (before.spread[source] / np.sqrt(elapsed))
     x, y = x * unit[:, None, None], y * unit[:, None]

@@ -29,13 +29,13 @@ from cellquant.track.shapes import Shapes, fit_shapes, population_of
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
 
-PASSES = 5
+PASSES = 6
 _UNLIKELY = 1e-4  # links below this probability are not offered to the assignment
 _MARGIN = 3.0  # of log odds below that, where links no longer matter to their rivals
 _SWEEPS = 6  # of belief propagation
 _SURE = 0.99  # a cell whose mother is known with this probability needs no division
-_DIVISION_PASS = 1  # the first pass that looks for divisions
-_IMAGE_PASS = 2  # the first pass that looks at the images
+_DIVISION_PASS = 2  # the first pass that looks for divisions
+_IMAGE_PASS = 3  # the first pass that looks at the images
 _SETTLED = 0.999  # cells whose partner is known with this probability need no image
 _CALIBRATION_CELLS = 2000  # compared in any case, to learn what images tell
 
@@ -165,7 +165,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         entering=entering,
         carried=carried,
         known=_paths(movie, None, flow, carried, options),
-        motion=first_motion(movie),
+        motion=first_motion(movie, flow, candidates),
         shapes=fit_shapes(movie, None, population_of(movie)),
         rates=fit_rates(movie, None, leaving, entering),
         sizes=log_frequency(movie.shape[:, LOG_AREA]),
@@ -193,7 +193,10 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
     movie, links = state.movie, state.links
     assert links is not None
     state.known = _paths(movie, links, state.flow, state.carried, options)
-    state.motion = fit_motion(movie, links, state.known, state.motion)
+    assert state.probability is not None
+    state.motion = fit_motion(
+        movie, links, state.candidates, state.probability, state.known, state.motion
+    )
     if options.use_shape:
         state.shapes = fit_shapes(movie, links, state.shapes.population)
     state.rates = fit_rates(movie, links, state.leaving, state.entering)
