@@ -107,6 +107,7 @@ def _by_frame(events: FloatArray, cells: FloatArray) -> FloatArray:
 def suppose_divisions(rates: Rates) -> Rates:
     """Rates for the first look for divisions: what appeared inside was mostly born there."""
     born = np.append(rates.appear[1:, INSIDE], rates.appear[-1:, INSIDE])
+    born = np.maximum(born, rates.divide)
     appear = rates.appear.copy()
     appear[:, INSIDE] *= _UNBORN
     return Rates(rates.vanish, appear, born)

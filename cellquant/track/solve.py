@@ -29,13 +29,14 @@ from cellquant.track.shapes import Shapes, fit_shapes, population_of
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
 
-PASSES = 6
+PASSES = 5
 _UNLIKELY = 1e-4  # links below this probability are not offered to the assignment
 _MARGIN = 3.0  # of log odds below that, where links no longer matter to their rivals
 _SWEEPS = 6  # of belief propagation
 _SURE = 0.99  # a cell whose mother is known with this probability needs no division
-_DIVISION_PASS = 2  # the first pass that looks for divisions
-_IMAGE_PASS = 3  # the first pass that looks at the images
+_DIVISION_PASS = 1  # the first pass that looks for divisions
+_FEW = 0.2  # divisions per newcomer below which the first look is repeated
+_IMAGE_PASS = 2  # the first pass that looks at the images
 _SETTLED = 0.999  # cells whose partner is known with this probability need no image
 _CALIBRATION_CELLS = 2000  # compared in any case, to learn what images tell
 
@@ -200,8 +201,12 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
     if options.use_shape:
         state.shapes = fit_shapes(movie, links, state.shapes.population)
     state.rates = fit_rates(movie, links, state.leaving, state.entering)
-    if options.divisions and turn == _DIVISION_PASS:
-        state.rates = suppose_divisions(state.rates)
+    if options.divisions and turn >= _DIVISION_PASS:
+        # A first look may come before steps are known well enough to leave a daughter over.
+        newcomers = int(np.sum(links.before[movie.start[1] :] < 0))
+        found = int(np.sum(links.second >= 0))
+        if turn == _DIVISION_PASS or (turn == _DIVISION_PASS + 1 and found < _FEW * newcomers):
+            state.rates = suppose_divisions(state.rates)
 
 
 def _add_images(state: Solution) -> None:
