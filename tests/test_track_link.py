@@ -301,6 +301,25 @@ def test_steps_scatter_more_in_a_frame_with_a_jolt() -> None:
     assert spread[2] > 2.0 * max(spread[i] for i in (0, 1, 3, 4))
 
 
+def test_a_wide_start_does_not_trust_the_shortest_links() -> None:
+    """Where steps are as long as cells are apart, a narrow start finds its own links short.
+
+    A start at a seventh of the spacing gets 41 % of these links right, a wide one 51 %.
+    """
+    rng = np.random.default_rng(1)
+    start = np.array([(x, y) for y in range(0, 300, 10) for x in range(0, 300, 10)], dtype=float)
+    start += rng.normal(scale=1.5, size=start.shape)
+    steps = rng.normal(scale=5.0, size=(4, *start.shape))
+    paths = np.concatenate((start[None], start + np.cumsum(steps, axis=0)))
+    cells = replace(cells_at(list(paths)), field_of_view=(300.0, 300.0))
+    movie = flatten(cells)
+    solution = solve(movie, Options(divisions=False))
+    assert solution.links is not None
+    after, n = solution.links.after, len(start)
+    right = after[: 4 * n] == np.arange(4 * n) + n
+    assert right.mean() > 0.46
+
+
 def test_cells_at_the_rim_of_a_layer_are_known() -> None:
     points = np.array([(x, y) for y in range(40, 70, 5) for x in range(40, 70, 5)], dtype=float)
     rim = flatten(cells_at([points, points])).rim[: len(points)]

@@ -35,6 +35,7 @@ _MARGIN = 3.0  # of log odds below that, where links no longer matter to their r
 _SWEEPS = 6  # of belief propagation
 _SURE = 0.99  # a cell whose mother is known with this probability needs no division
 _DIVISION_PASS = 1  # the first pass that looks for divisions
+_WIDE, _EARLY = 0.75, 2  # a start wider than this, in spacings, takes more passes to settle
 _FEW = 0.2  # divisions per newcomer below which the first look is repeated
 _IMAGE_PASS = 2  # the first pass that looks at the images
 _SETTLED = 0.999  # cells whose partner is known with this probability need no image
@@ -106,12 +107,14 @@ def solve(
         Called with the number of steps done and of all steps.
     """
     pairs = len(movie.time) - 1
-    total = (PASSES + 1) * pairs
     state = _start(movie, options)
+    wide = state.motion.scale[0] > _WIDE * float(np.median(movie.spacing))
+    early = _EARLY if wide else 0
+    total = (PASSES + early + 1) * pairs
     images = None
     if progress is not None:
         progress(pairs, total)
-    for turn in range(PASSES):
+    for turn in range(-early, PASSES):
         if state.links is not None:
             _refit(state, options, turn)
         state.fates = fates(movie, state.links, state.rates, state.leaving, state.entering)
@@ -146,7 +149,7 @@ def solve(
             )
         state.links = _assign(state, middle, images)
         if progress is not None:
-            progress((turn + 2) * pairs, total)
+            progress((turn + early + 2) * pairs, total)
     return state
 
 
