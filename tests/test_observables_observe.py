@@ -1,6 +1,7 @@
 """`observe`: the contract of its files, what it computes, and input at the edge of sense."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -217,6 +218,23 @@ def test_chosen_ranges_of_the_van_hove_fits_are_kept() -> None:
     assert found["tail_range"][0] == 0.3
     assert found["tail_range"][1] <= 0.9
     assert found["tail_core_n"] == 0
+
+
+@pytest.mark.slow
+def test_any_number_of_threads_gives_the_same_bytes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(15)
+    brownian(rng, 900, 60, box=(30.0, 30.0)).write(tmp_path / "tracks.parquet")
+    for threads in ("1", "2"):
+        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+        subprocess.run(
+            [sys.executable, "-m", "cellquant", "observe", str(tmp_path), "-o", tmp_path / threads],
+            env={**os.environ, **dict.fromkeys(names, threads)},
+            check=True,
+            capture_output=True,
+        )
+    for file in (tmp_path / "1").iterdir():
+        if file.name != "run.json":
+            assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes(), file.name
 
 
 def test_what_is_not_a_source_is_refused() -> None:

@@ -353,3 +353,35 @@ def overlap_series(
         by_track,
     )
     return inside, pairs, np.ascontiguousarray(by_track.T)
+
+
+@njit(cache=True, parallel=True)
+def _add_waves(
+    q_x: FloatArray, x: FloatArray, real_y: FloatArray, imag_y: FloatArray, out: Any
+) -> None:
+    for a in prange(q_x.size):
+        for j in range(x.size):
+            c, s = np.cos(q_x[a] * x[j]), np.sin(q_x[a] * x[j])
+            for b in range(real_y.shape[1]):
+                out[0, a, b] += c * real_y[j, b] - s * imag_y[j, b]
+                out[1, a, b] += c * imag_y[j, b] + s * real_y[j, b]
+
+
+def waves(q_x: FloatArray, q_y: FloatArray, place: FloatArray) -> FloatArray:
+    """(2, n_x, n_y) real and imaginary part of ``sum_j exp(i q . r_j)`` on a grid of q.
+
+    Cell after cell: the last digits of a matrix product depend on the number of threads.
+
+    Parameters
+    ----------
+    q_x, q_y
+        Wave numbers along the axes.
+    place
+        (n, 2) positions.
+    """
+    out = np.zeros((2, q_x.size, q_y.size))
+    for start in range(0, len(place), 256):
+        x, y = place[start : start + 256].T
+        angle = np.outer(y, q_y)
+        _add_waves(q_x, np.ascontiguousarray(x), np.cos(angle), np.sin(angle), out)
+    return out

@@ -58,7 +58,8 @@ def _distribution(context: Context, out: Results, name: str) -> None:
     def of_piece(piece: Piece) -> Any:
         used = ~piece["touches_border"] & np.isfinite(piece["shape_index"])
         used &= np.isfinite(piece[name])
-        numbers.append(((piece["frame"][used] - first) // points).astype(np.int32))
+        if not context.no_bin:
+            numbers.append(((piece["frame"][used] - first) // points).astype(np.int32))
         return used, piece[name][used]
 
     columns = ("frame", "shape_index", name, "touches_border")

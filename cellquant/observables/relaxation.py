@@ -181,7 +181,8 @@ def _bootstrap(average: LagAverage, threshold: float, n: int, seed: int) -> Floa
     rng = np.random.default_rng(seed)
     weight = rng.multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), size=n).astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
-        curves = (weight @ sums) / (weight @ counts)
+        # Not a matrix product, whose last digits depend on the number of threads.
+        curves = np.einsum("nb,bl->nl", weight, sums) / np.einsum("nb,bl->nl", weight, counts)
     times = np.array([crossing_time(average.lag_time, c, threshold) for c in curves])
     return np.sort(times[~np.isnan(times)])
 

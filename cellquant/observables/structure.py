@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cellquant.observables import kernels
 from cellquant.observables.blocks import jackknife_error, leave_one_out
 from cellquant.observables.layer import Layer, layer_of, positions_by_frame
 from cellquant.observables.trajectories import FloatArray, IntArray
@@ -96,11 +97,8 @@ def structure_factor(
     half = (q > 0) & (q <= limit) & ~((q_x[:, None] == 0) & (q_y[None, :] < 0))
     shells = _Shells.of(q[half], float(step.max()))
     for place in frames:
-        wave = np.zeros(q.shape, dtype=np.complex128)
-        for start in range(0, len(place), 256):
-            x, y = place[start : start + 256].T
-            wave += np.exp(-1j * np.outer(q_x, x)) @ np.exp(-1j * np.outer(y, q_y))
-        shells.add((np.abs(wave) ** 2 / len(place))[half])
+        real, imaginary = kernels.waves(q_x, q_y, place)
+        shells.add(((real**2 + imaginary**2) / len(place))[half])
     return _summarise(shells, scale)
 
 

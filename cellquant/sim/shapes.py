@@ -57,18 +57,14 @@ def contours(
 
 
 def shape_indices(modes: Floats) -> Floats:
-    """(...) shape index P / sqrt(A) of contours with modes (..., 2, M - 1), as `measure_shapes`."""
-    n = np.arange(2, modes.shape[-1] + 2)
-    points = 32 * max(6, modes.shape[-1] + 1)
-    angle = 2.0 * math.pi * np.outer(n, np.arange(points)) / points
-    even, odd = np.cos(angle), np.sin(angle)
-    a, b = modes[..., 0, :], modes[..., 1, :]
-    mean = np.sqrt(1.0 - 0.5 * np.sum(modes**2, axis=(-2, -1)))
-    rho = mean[..., None] + a @ even + b @ odd
-    slope = (n * b) @ even - (n * a) @ odd
-    lengths: Floats = np.sqrt(rho * rho + slope * slope).sum(axis=-1)
-    lengths *= 2.0 * math.pi / points / math.sqrt(math.pi)
-    return lengths
+    """(N,) shape index P / sqrt(A) of contours with modes (N, 2, M - 1), as `measure_shapes`."""
+    n, waves = _directions(modes.shape[2])
+    found = []
+    for start in range(0, len(modes), _BATCH):
+        rho, slope = _terms(modes[start : start + _BATCH], n, waves)
+        length = np.sqrt(rho * rho + slope * slope).sum(axis=1)
+        found.append(length * (2.0 * math.pi / rho.shape[1] / math.sqrt(math.pi)))
+    return np.concatenate(found or [np.empty(0)])
 
 
 def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFrame:
@@ -91,10 +87,7 @@ def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFr
         moments), orientation (of the long axis, radians in (-pi/2, pi/2]), offset_x and offset_y
         of the centre of mass from the centre of the contour.
     """
-    n = np.arange(2, modes.shape[2] + 2)
-    points = 32 * max(6, modes.shape[2] + 1)
-    angle = 2.0 * math.pi * np.outer(n, np.arange(points)) / points
-    waves = np.cos(angle), np.sin(angle)
+    n, waves = _directions(modes.shape[2])
     parts = [
         _moments(modes[start : start + _BATCH], n, waves) for start in range(0, len(radius), _BATCH)
     ]
@@ -119,10 +112,17 @@ def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFr
     )
 
 
-def _moments(modes: Floats, n: Floats, waves: tuple[Floats, Floats]) -> Floats:
-    """(N, 7) perimeter, area, centre of mass and second moments of contours with R0 = 1.
+def _directions(n_modes: int) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Orders of the modes, and their cosines and sines in every direction."""
+    n, points = np.arange(2.0, n_modes + 2), 32 * max(6, n_modes + 1)
+    angle = 2.0 * math.pi * np.outer(n, np.arange(points)) / points
+    return n, (np.cos(angle), np.sin(angle))
 
-    Term by term instead of matrix products, whose last digits depend on the cells beside.
+
+def _terms(modes: Floats, n: Floats, waves: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """(N, points) radius and slope of contours with R0 = 1 in the frame of the polarity.
+
+    Term by term: the last digits of a matrix product depend on threads and on the cells beside.
     """
     even, odd = waves
     a, b = modes[:, 0, :, None], modes[:, 1, :, None]
@@ -131,7 +131,13 @@ def _moments(modes: Floats, n: Floats, waves: tuple[Floats, Floats]) -> Floats:
     for k, order in enumerate(n):
         rho += a[:, k] * even[k] + b[:, k] * odd[k]
         slope += (order * b[:, k]) * even[k] - (order * a[:, k]) * odd[k]
-    angle = 2.0 * math.pi * np.arange(even.shape[1]) / even.shape[1]
+    return rho, slope
+
+
+def _moments(modes: Floats, n: Floats, waves: tuple[Floats, Floats]) -> Floats:
+    """(N, 7) perimeter, area, centre of mass and second moments of contours with R0 = 1."""
+    rho, slope = _terms(modes, n, waves)
+    angle = 2.0 * math.pi * np.arange(rho.shape[1]) / rho.shape[1]
     c, s = np.cos(angle), np.sin(angle)
     d = angle[1]
     square = rho * rho
