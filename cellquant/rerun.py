@@ -19,6 +19,7 @@ from cellquant.fingerprint import code_digest
 from cellquant.storage import FINISHED, MANIFEST, check_output, digest, libraries
 
 Progress = Callable[[int, int], None]
+_LINKING = ("max_distance", "divisions", "linker", "max_gap")
 _TABLES = ("*.parquet", "summary.json", "statistics.json")
 _ARRAYS = ("time", "position", "polarity", "modes", "radius", "box")
 
@@ -186,7 +187,7 @@ def _track(record: Mapping[str, Any], out: Path, workers: int, progress: Progres
         stack,
         out,
         raw=None if raw is None else read_images(_found(raw, record)),
-        options={name: settings[name] for name in ("max_distance", "divisions", "linker")},
+        options={name: settings[name] for name in _LINKING if name in settings},
     )
 
 

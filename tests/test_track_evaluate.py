@@ -83,3 +83,26 @@ def test_true_links_make_no_error_in_the_dynamics(recordings: Path) -> None:
     assert np.allclose(error.table["msd_relative_error"], 0.0, atol=1e-12)
     assert np.allclose(error.table["scattering_error"], 0.0, atol=1e-12)
     assert error.tau_alpha == error.true_tau_alpha
+    assert error.reason is None
+    assert error.as_lines()[0].startswith("error of MSD from linking: +0 % at most")
+
+
+def test_wrong_links_change_the_dynamics_and_short_movies_say_why(
+    recordings: Path, truth: pd.DataFrame
+) -> None:
+    """Tracks that change places half way move too far: MSD too great, F_s too small."""
+    folder = recordings / "epidermis_area1"
+    late = truth["frame"] >= 7
+    table = truth.assign(track_id=truth["track_id"].where(~late, truth["track_id"] + 1))
+    table["parent_track_id"] = 0
+    table = table.drop_duplicates(["track_id", "frame"]).sort_values(
+        ["track_id", "frame"], ignore_index=True
+    )
+    wrong = tracks_of(table)
+    error = dynamics_error(wrong, folder, min_points=4, window=15)
+    assert error.table["msd_relative_error"].iloc[0] > 0.5
+    assert error.table["scattering_error"].iloc[0] < 0.0
+    assert set(error.as_dict()) > {"msd_relative_error", "scattering_error", "true_tau_alpha"}
+    short = dynamics_error(wrong, folder)
+    assert short.table.empty
+    assert "24 consecutive points" in short.as_lines()[0]

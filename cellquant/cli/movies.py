@@ -100,6 +100,14 @@ def track(
         ),
     ] = None,
     divisions: Annotated[bool, typer.Option(help="Look for divisions.")] = True,
+    max_gap: Annotated[
+        int,
+        typer.Option(
+            help="Frames that a cell may be missing and still be followed; 0 for masks that miss "
+            "none.",
+            metavar="FRAMES",
+        ),
+    ] = 2,
     linker: Annotated[
         Linker, typer.Option(help="'trackpy' is the plain nearest-neighbour baseline.")
     ] = Linker.cues,
@@ -122,6 +130,7 @@ def track(
         "max_distance": max_distance,
         "divisions": divisions,
         "linker": linker.value,
+        "max_gap": max_gap,
     }
     cells, tracks, _ = track_movie(
         stack,
@@ -175,17 +184,31 @@ def evaluate(
     tracks: Annotated[Path, typer.Argument(help="Folder or parquet file of tracks.")],
     truth: Annotated[Path, typer.Option(help="CTC folder with the true tracks.")],
     json: Annotated[Path | None, typer.Option(help="Write the scores to this file.")] = None,
+    frame_tolerance: Annotated[
+        int, typer.Option(help="Frames by which a division may be off in the tolerant score.")
+    ] = 1,
+    min_points: Annotated[
+        int | None,
+        typer.Option(help="Consecutive points of a trajectory whose dynamics are compared; 24."),
+    ] = None,
 ) -> None:
-    """Score tracks against the truth: edge F1, division F1, LNK, TRA, IDF1."""
+    """Score tracks against the truth: edge F1, division F1, LNK, TRA, IDF1.
+
+    Tells besides how far MSD, F_s and tau_alpha are off because of wrong links.
+    """
     from cellquant.storage import write_json
     from cellquant.tables import read_tracks
+    from cellquant.track.consequences import dynamics_error
     from cellquant.track.evaluate import evaluate as score_tracks
 
-    scores = score_tracks(read_tracks(tracks), truth)
-    for line in scores.as_lines():
+    found = read_tracks(tracks)
+    scores = score_tracks(found, truth, frame_tolerance=frame_tolerance)
+    points = {} if min_points is None else {"min_points": min_points}
+    dynamics = dynamics_error(found, truth, **points)
+    for line in (*scores.as_lines(), *dynamics.as_lines()):
         say(line)
     if json is not None:
-        write_json(json, scores.as_dict())
+        write_json(json, {**scores.as_dict(), "dynamics": dynamics.as_dict()})
 
 
 def observe(

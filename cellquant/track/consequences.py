@@ -11,19 +11,66 @@ from cellquant.observables import Observables, observe
 from cellquant.tables import Tracks
 from cellquant.track.evaluate import match_cells, pixel_size_of, read_truth
 
+_PAIRS = 100  # pairs of points below which a lag is not spoken of
+
 
 @dataclass(frozen=True)
 class DynamicsError:
     """Errors of dynamical observables that linking alone causes.
 
-    ``table`` has one row per lag: lag_time, and value, true value and relative error (MSD) or
-    difference (F_s) of each. ``tau_alpha`` and ``true_tau_alpha`` are None where the curve does
-    not reach 1/e within the movie.
+    ``table`` has one row per lag: lag_time, n_pairs (of the side that has fewer), and value, true
+    value and relative error (MSD) or difference (F_s) of each. ``tau_alpha`` and
+    ``true_tau_alpha`` are None where the curve does not reach 1/e within the movie. ``reason``
+    says why nothing could be measured.
     """
 
     table: pd.DataFrame
     tau_alpha: float | None
     true_tau_alpha: float | None
+    time_unit: str
+    reason: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Every number by name, NaN as None."""
+        columns = {
+            str(name): [None if np.isnan(value) else float(value) for value in column]
+            for name, column in self.table.items()
+        }
+        return {
+            **columns,
+            "tau_alpha": self.tau_alpha,
+            "true_tau_alpha": self.true_tau_alpha,
+            "time_unit": self.time_unit,
+            "reason": self.reason,
+        }
+
+    def as_lines(self) -> list[str]:
+        """The errors as text."""
+        if self.reason is not None:
+            return [f"dynamics: not measurable, {self.reason}"]
+        lines = []
+        for name, column, factor, unit in (
+            ("MSD", "msd_relative_error", 100.0, " %"),
+            ("F_s", "scattering_error", 1.0, ""),
+        ):
+            many = self.table[self.table["n_pairs"] >= _PAIRS].dropna(subset=[column])
+            if many.empty:
+                lines.append(f"error of {name} from linking: no lag has {_PAIRS} pairs of points")
+                continue
+            error = factor * many[column].to_numpy(np.float64)
+            worst = int(np.argmax(np.abs(error)))
+            lag = float(many["lag_time"].to_numpy()[worst])
+            lines.append(
+                f"error of {name} from linking: {error[worst]:+.3g}{unit} at most, at a lag of "
+                f"{lag:g} {self.time_unit}; root mean square over "
+                f"{len(error)} lags {np.sqrt(np.mean(error**2)):.2g}{unit}"
+            )
+        values = [
+            "not reached" if tau is None else f"{tau:.4g} {self.time_unit}"
+            for tau in (self.tau_alpha, self.true_tau_alpha)
+        ]
+        lines.append(f"tau_alpha: {values[0]}, of the true links {values[1]}")
+        return lines
 
 
 def dynamics_error(tracks: Tracks, truth: str | Path, **options: Any) -> DynamicsError:
@@ -64,6 +111,7 @@ def dynamics_error(tracks: Tracks, truth: str | Path, **options: Any) -> Dynamic
     table = pd.DataFrame(
         {
             "lag_time": msd["lag_time"],
+            "n_pairs": msd["n_pairs"],
             "msd": msd["value"],
             "true_msd": msd["true"],
             "msd_relative_error": msd["value"] / msd["true"] - 1.0,
@@ -80,15 +128,23 @@ def dynamics_error(tracks: Tracks, truth: str | Path, **options: Any) -> Dynamic
         on="lag_time",
         how="outer",
     )
-    return DynamicsError(table, _tau(found), _tau(true))
+    reason = None
+    if table.empty:
+        reason = str(found.summary.get("msd", {}).get("reason") or "no lag could be measured")
+    return DynamicsError(table, _tau(found), _tau(true), tracks.units.time, reason)
 
 
 def _beside(found: Observables, true: Observables, name: str) -> pd.DataFrame:
     def whole(result: Observables) -> pd.DataFrame:
-        mean = result.tables[name].groupby("lag_time")["value"].mean()
-        return pd.DataFrame({"lag_time": mean.index.to_numpy(), "value": mean.to_numpy()})
+        table = result.tables[name]
+        if "scope" in table:  # the whole movie, not its windows
+            table = table[table["scope"] == "all"]
+        return table[["lag_time", "value", "n_pairs"]]
 
-    return whole(found).merge(whole(true).rename(columns={"value": "true"}), on="lag_time")
+    other = whole(true).rename(columns={"value": "true", "n_pairs": "true_pairs"})
+    beside = whole(found).merge(other, on="lag_time")
+    beside["n_pairs"] = np.minimum(beside["n_pairs"], beside.pop("true_pairs"))
+    return beside
 
 
 def _tau(result: Observables) -> float | None:

@@ -99,7 +99,8 @@ def track_cells(
     max_gap
         Frames that a cell may be missing and still be followed.
     progress
-        Called with the number of steps done and of all steps.
+        Called with the number of frames done and of all frames, as it were: every pass goes over
+        all of them.
 
     Returns
     -------

@@ -104,16 +104,16 @@ def solve(
     pixel_size
         Edge of a pixel in the unit of the positions.
     progress
-        Called with the number of steps done and of all steps.
+        Called with the number of frames done and of all frames, as it were: every pass goes over
+        all of them.
     """
-    pairs = len(movie.time) - 1
     state = _start(movie, options)
     wide = state.motion.scale[0] > _WIDE * float(np.median(movie.spacing))
     early = _EARLY if wide else 0
-    total = (PASSES + early + 1) * pairs
+    frames, total = len(movie.time), PASSES + early + 1
     images = None
     if progress is not None:
-        progress(pairs, total)
+        progress(frames // total, frames)
     for turn in range(-early, PASSES):
         if state.links is not None:
             _refit(state, options, turn)
@@ -149,7 +149,7 @@ def solve(
             )
         state.links = _assign(state, middle, images)
         if progress is not None:
-            progress((turn + early + 2) * pairs, total)
+            progress(frames * (turn + early + 2) // total, frames)
     return state
 
 
