@@ -190,6 +190,7 @@ def test_max_distance_forbids_longer_steps() -> None:
     paths = lattice()[None] + np.arange(5)[:, None, None] * np.array([6.0, 0.0])
     tracks = cq.track(stack_of(discs(paths)), max_distance=4.0)
     assert tracks.provenance["links"] == 0
+    assert (tracks.table["parent_track_id"] == 0).all()
 
 
 def test_trackpy_baseline_follows_slow_cells() -> None:

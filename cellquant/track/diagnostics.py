@@ -103,7 +103,7 @@ def _warnings(
     if len(linked) < 0.5 * (movie.n_cells - (movie.start[1] - movie.start[0])):
         texts.append(
             "fewer than half of the cells were found again in the next frame; check that the "
-            "masks are in order of time"
+            "masks are in order of time, and the longest step allowed if one was given"
         )
     missing = movie.time[1:][np.diff(movie.time) > 1]
     if len(missing):

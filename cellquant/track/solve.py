@@ -250,9 +250,12 @@ def _families(
     """Divisions worth considering, their log odds, and how the images of them look."""
     assert state.divisions is not None
     assert state.fates is not None
+    assert state.gain is not None
+    # A daughter is no farther from its mother than a step may be long.
+    candidates = np.where(np.isneginf(state.gain), -1, state.candidates)
     cells, gain = propose(
         state.movie,
-        state.candidates,
+        candidates,
         orphan,
         middle,
         state.divisions,
