@@ -279,7 +279,7 @@ def _in_one_period(group: "Group", loop: Loop) -> "Group":
 
 def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
     """The closed loop on the page: the table of errors and the two sides in matched figures."""
-    from cellquant.compare import matched_figures
+    from cellquant.compare import layers, matched_figures
     from cellquant.compare.groups import read_groups
     from cellquant.compare.page import Section
 
@@ -287,10 +287,10 @@ def _loop_section(folder: Path, loop: Loop, scene: SceneConfig) -> "Section":
     groups = read_groups(
         [folder / "found", folder / "truth"], names=["measured on masks", "known truth"]
     )
-    seen = [_in_one_period(group, loop) for group in matched_figures.add_sources(groups)]
+    seen = [_in_one_period(group, loop) for group in layers.add_sources(groups)]
     figures = (
-        matched_figures.layer_figure(seen),
-        *matched_figures.path_figures(seen),
+        layers.layer_figure(seen),
+        *layers.path_figures(seen),
         matched_figures.shape_figure(groups),
         matched_figures.scattering_figure(groups),
         matched_figures.displacement_figure(groups),

@@ -28,6 +28,7 @@ from cellquant.compare.comparison import (
 from cellquant.compare.comparison_page import command_of
 from cellquant.compare.comparison_tables import units_section
 from cellquant.compare.groups import Group, read_groups
+from cellquant.compare.layers import n_moments
 from cellquant.compare.matched_figures import scattering_figure
 from cellquant.compare.matching import Matched, matched_scalars
 from cellquant.compare.page import format_value
@@ -218,6 +219,10 @@ def test_a_group_that_relaxes_in_part_is_drawn_in_its_own_time(movie, model) -> 
     assert at_one == pytest.approx(math.exp(-1), abs=1e-6)
     scale = table["lag_time"].to_numpy() / drawn["lag_over_tau_alpha"].to_numpy()
     np.testing.assert_allclose(scale, scale[0])
+
+
+def test_pages_with_large_layers_hold_fewer_moments() -> None:
+    assert [n_moments(n) for n in (0, 600, 6000, 60_000)] == [5, 5, 2, 1]
 
 
 def test_effective_packing_fraction_is_that_of_the_area_and_of_the_scene(movie, model) -> None:

@@ -19,16 +19,18 @@ from cellquant.compare.comparison_tables import (
 )
 from cellquant.compare.fit import fit_sections
 from cellquant.compare.groups import Group
-from cellquant.compare.matched_figures import (
+from cellquant.compare.layers import (
     MAX_PICTURES,
     add_sources,
-    displacement_figure,
-    hove_figure,
     layer_figure,
     path_figures,
+    with_pictures,
+)
+from cellquant.compare.matched_figures import (
+    displacement_figure,
+    hove_figure,
     scattering_figure,
     shape_figure,
-    with_pictures,
 )
 from cellquant.compare.matching import matched_scalars
 from cellquant.compare.page import (

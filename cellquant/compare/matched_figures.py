@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,21 +19,9 @@ from cellquant.compare.figures import (
 from cellquant.compare.groups import Group
 from cellquant.compare.page import Figure, Panel
 from cellquant.compare.panels import join_curves, shape_limits
-from cellquant.compare.sources import with_sources
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from cellquant.compare.pictures import MaskFrame
-    from cellquant.io import LabelStack
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 MAX_CURVES = 6
-MAX_PICTURES = 3
-MAX_PATH_POINTS = 2500
-MAX_STEPS = 5  # moments of a layer to step through
-ALL = 2**31  # frames, more than any recording has
-SQUARE = 8.0  # mean diameters, edge of the enlarged part of the trajectories
 Measure = Callable[[Group, int], list[Curve]]
 
 
@@ -139,191 +127,6 @@ def hove_figure(groups: Sequence[Group]) -> Figure | None:
                 limits=common_limits([c.y for c in every], log=True)),
         column="r_over_d",
     )  # fmt: skip
-
-
-def layer_figure(groups: Sequence[Group]) -> Figure | None:
-    """Segmented frames of a movie beside snapshots of the model, to step through."""
-    from cellquant.compare.pictures import STEP_PIXELS, contours_of, draw_contours, draw_masks
-
-    panels = []
-    for index, group in enumerate(with_pictures(groups)):
-        result = group.members[0]
-        name = f"layer-{index + 1}"
-        if result.stack is not None:
-            frames = _mask_frames(group, result.stack)
-            calibration = result.stack.calibration
-            svg = draw_masks(
-                frames,
-                shown=len(frames) - 1,
-                pixel_size=calibration.pixel_size,
-                units=calibration.units,
-                step_pixels=STEP_PIXELS,
-            )
-            words = (
-                f"Segmented cells of {group.name} in different colours at {frames[-1].title}, the "
-                "last frame."
-            )
-        elif result.run is not None:
-            run = result.run
-            times = np.asarray(run.time, dtype=np.float64)
-            interval = float(times[1] - times[0]) if times.size > 1 else 1.0
-            titles = {
-                frame: f"t = {times[frame] - times[0]:g} t₀"
-                for frame in _steps(group, times.size, interval)
-            }
-            *others, last = titles
-            svg = draw_contours(
-                *contours_of(run),
-                units=result.units,
-                title=titles[last],
-                earlier=[(titles[f], contours_of(run, frame=f, points=24)[0]) for f in others],
-            )
-            words = f"Contours of all cells of {group.name} at the end of the run."
-        else:
-            continue
-        panels.append(Panel(name, svg, words, group.name))
-    if not panels:
-        return None
-    return Figure(
-        name="layer",
-        title="The layer at work",
-        caption="The first recording of each group at its end; step back through the two "
-        "relaxation times before, or the whole recording where τ_{α} is not known or it is "
-        "shorter. Movies: segmented cells. Simulations: contours of all cells; the layer continues "
-        "periodically at its edges. A cell keeps its colour; grey ones are not followed.",
-        panels=tuple(panels),
-        wide=True,
-    )
-
-
-def _steps(group: Group, n_frames: int, interval: float) -> list[int]:
-    """Up to `MAX_STEPS` frames, evenly over the last two relaxation times, the last included."""
-    last = n_frames - 1
-    first = max(0, last - _two_relaxations(group, interval)) if last else 0
-    return sorted(set(np.linspace(first, last, MAX_STEPS).round().astype(int).tolist()))
-
-
-def _mask_frames(group: Group, stack: "LabelStack") -> "list[MaskFrame]":
-    from cellquant.compare.pictures import MaskFrame
-
-    tracks = group.members[0].tracks
-    frames = []
-    for index in _steps(group, len(stack), stack.calibration.frame_interval):
-        number = stack.frame_numbers[index]
-        title, known = f"frame {number}", None
-        if tracks is not None:
-            here = tracks.table[tracks.table["frame"] == number]
-            known = dict(zip(here["label"].tolist(), here["track_id"].tolist(), strict=True))
-            if tracks.units.time != "frame":
-                title = f"t = {number * tracks.frame_interval:g} {tracks.units.time}"
-        frames.append(MaskFrame(stack[index], title, identities=known))
-    return frames
-
-
-def path_figures(groups: Sequence[Group]) -> list[Figure]:
-    """Trajectories of the whole layer, and a window of the same size in cell diameters."""
-    import pandas as pd
-
-    from cellquant.compare.pictures import draw_paths, thin_paths
-    from cellquant.tables import Units
-
-    views: dict[str, list[Panel]] = {"whole": [], "close": []}
-    data: dict[str, list[pd.DataFrame]] = {"whole": [], "close": []}
-    for index, group in enumerate(with_pictures(groups)):
-        tracks = group.members[0].tracks
-        d = group.scalars().get("wave_number.mean_diameter")
-        if tracks is None or d is None or tracks.table.empty:
-            continue
-        table = tracks.table[["track_id", "frame", "x", "y"]].copy()
-        table[["x", "y"]] /= d.value
-        recent, span = _recent(table, group, tracks.frame_interval)
-        if tracks.box is None:
-            low, high = table[["x", "y"]].min().to_numpy(), table[["x", "y"]].max().to_numpy()
-        else:
-            low, high = np.zeros(2), np.array(tracks.box) / d.value
-            ends = recent.groupby("track_id")[["x", "y"]].transform("last")
-            recent = recent.assign(**(recent[["x", "y"]] - np.floor(ends / high) * high))
-        middle = 0.5 * (low + high)
-        square = (middle[0] - SQUARE / 2, middle[0] + SQUARE / 2,
-                  middle[1] - SQUARE / 2, middle[1] + SQUARE / 2)  # fmt: skip
-        inside = recent["x"].between(*square[:2]) & recent["y"].between(*square[2:])
-        near = recent[recent["track_id"].isin(recent.loc[inside, "track_id"].unique())]
-        units = Units("d", tracks.units.time)
-        for view, chosen, window in (
-            ("whole", recent, (low[0], high[0], low[1], high[1])),
-            ("close", near, square),
-        ):
-            paths = thin_paths(chosen, max_points=MAX_PATH_POINTS)
-            if paths.empty:
-                continue
-            name = f"paths-{view}-{index + 1}"
-            svg = draw_paths(paths, name, units=units, window=window,
-                             frame=square if view == "whole" else None)  # fmt: skip
-            shown = "in the marked square" if view == "close" else "in view"
-            words = f"Paths of the cells of {group.name} {shown}, over {span}."
-            views[view].append(Panel(name, svg, words, group.name))
-            # Short rows: these are the longest tables of the page.
-            data[view].append(paths.round({"x": 3, "y": 3}).assign(drawing=len(views[view])))
-    captions = {
-        "whole": (
-            "Trajectories",
-            "The last two relaxation times, or the whole recording where τ_{α} is not known or the "
-            "recording is shorter. Dots mark where the paths end; lengths are in mean cell "
-            "diameters d. Of a simulated layer, which is periodic, one period is shown. The marked "
-            "square is enlarged below. In the CSV, drawing counts from 1.",
-        ),
-        "close": (
-            "Trajectories, enlarged to the same scale",
-            f"A square of {SQUARE:g} by {SQUARE:g} cell diameters on every side, so that paths can "
-            "be compared by eye.",
-        ),
-    }
-    return [
-        Figure(f"paths-{view}", *captions[view], tuple(panels),
-               pd.concat(data[view], ignore_index=True), wide=True)
-        for view, panels in views.items() if panels
-    ]  # fmt: skip
-
-
-def _recent(
-    table: "pd.DataFrame", group: Group, frame_interval: float
-) -> "tuple[pd.DataFrame, str]":
-    """The part of the trajectories that lies in the last two relaxation times."""
-    span = _two_relaxations(group, frame_interval)
-    known = span < ALL
-    words = "the last two relaxation times" if known else "the whole recording"
-    return table[table["frame"] > table["frame"].max() - span] if known else table, words
-
-
-def _two_relaxations(group: Group, frame_interval: float) -> int:
-    """Two relaxation times in frames; `ALL` where the relaxation time is not known."""
-    tau = group.scalars().get("tau_alpha.value")
-    if tau is None or not math.isfinite(tau.value):
-        return ALL
-    return max(2, round(2 * tau.value / frame_interval))
-
-
-def add_sources(groups: Sequence[Group]) -> list[Group]:
-    """Add trajectories, masks and runs to the groups whose pictures will be shown."""
-    taken = {False: 0, True: 0}
-    out = []
-    for group in groups:
-        taken[group.simulated] += 1
-        if taken[group.simulated] > MAX_PICTURES:
-            out.append(group)
-            continue
-        first, *rest = group.trials.items()
-        head = (with_sources(first[1][0]), *first[1][1:])
-        out.append(replace(group, trials={first[0]: head, **dict(rest)}))
-    return out
-
-
-def with_pictures(groups: Sequence[Group]) -> list[Group]:
-    """The first few groups of each side that have something to show."""
-    shown = []
-    for simulated in (False, True):
-        shown += [g for g in groups if g.simulated is simulated][:MAX_PICTURES]
-    return [g for g in shown if g.members[0].tracks is not None]
 
 
 def _by_side(groups: Sequence[Group], measure: Measure) -> list[tuple[str, list[Curve]]]:
