@@ -148,7 +148,7 @@ def test_chance_of_being_the_closest_is_that_of_the_errors() -> None:
     lone = rank_candidates(layer("t", 3.8 - 3 * apart), scenes[1:])
     assert lone.statement() == (
         "off is closest, in 100% of the draws. "
-        "It does not match: 4.0 combined standard errors apart."
+        "It does not match: 4.00 combined standard errors apart."
     )
 
 

@@ -185,7 +185,7 @@ class Ranking:
             found = f"{first.name} is closest, in {first.best_probability:.0%} of the draws."
         if first.distance <= MATCH:
             return found
-        return f"{found} It does not match: {first.distance:.1f} combined standard errors apart."
+        return f"{found} It does not match: {first.distance:.2f} combined standard errors apart."
 
 
 def rank_candidates(
