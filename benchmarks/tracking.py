@@ -27,6 +27,8 @@ from layers import data_folder, shuffled, voronoi_layer
 
 RESULTS = Path(__file__).parent / "results"
 SETS = (("epidermis_area1", 1), ("cell_migration", 1), ("cell_migration", 3), ("cell_migration", 7))
+# Frames of one layer of 1000 cells, and copies of it side by side.
+SIZES = ((20, 1), (40, 1), (80, 1), (145, 1), (5, 1), (5, 2), (5, 5))
 LIMITS = (0.35, 0.5, 0.7, 1.0)  # search ranges of the peers, in spacings; the best is shown
 
 
@@ -336,8 +338,7 @@ def tiled(masks: np.ndarray, times: int) -> np.ndarray:
 def speed() -> list[dict]:
     lines = []
     layer, _ = shuffled(voronoi_layer(1300, 145, step=0.15).masks)
-    # Longer movies of one layer, then wider layers of few frames.
-    for n_frames, times in ((20, 1), (40, 1), (80, 1), (145, 1), (5, 1), (5, 2), (5, 5)):
+    for n_frames, times in SIZES:
         labels = LabelStack.from_array(tiled(layer[:n_frames], times), units="pixel")
         cells = measure_cells(labels)
         spacing = float(np.median(flatten(cells).spacing))
@@ -384,7 +385,8 @@ TITLES = {
     "cells, no divisions; peers with the best of four search ranges)",
     "faults": "Edge F1 among intact cells when a share of the others is deleted, split or merged "
     "(centroids and moments alone)",
-    "speed": "CPU seconds, median of three interleaved runs; 'centroids': cellquant without masks",
+    "speed": "CPU seconds on one thread, median of three interleaved runs; 'centroids': cellquant "
+    "without masks; LapTrack on the centroids of the first movie (shown here: one run)",
 }
 
 
