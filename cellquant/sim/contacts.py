@@ -88,21 +88,21 @@ class Layer:
         size = outlines.samples_of(scene.modes) if contact == "exact" else points
         self._table, single = outlines.compass(scene.modes, size)
         spare = lanes.QUAD - 1  # rows that the last tile of cells may write to
-        self._record = np.zeros((n_cells + spare, records.record_length(n_modes)))[:n_cells]
+        self._record = lanes.zeros(n_cells + spare, records.record_length(n_modes))[:n_cells]
         self._energy = np.zeros(n_cells)
         if contact == "exact":
             self._single = single
             self._work = crossings.work(1, size)
             self._rim = outlines.rim(size)
-            self._circle = np.zeros((size, 4))
+            self._circle = lanes.zeros(size, 4)
             self._circle[:, :2] = self._table[:2].T
             self._quarter, self._starts = outlines.quarter_points(scene.modes)
-            self._grid = np.zeros((n_cells, 2, outlines.row_of_samples(size)), np.float32)
+            self._grid = lanes.zeros(n_cells, 2, outlines.row_of_samples(size), kind=np.float32)
             self._pattern = np.zeros((n_cells, 1 + 4 * n_modes), np.float32)
-            self._tangent = np.zeros((n_cells, (2 * n_modes + 5) // 4 * 4))
+            self._tangent = lanes.zeros(n_cells, (2 * n_modes + 5) // 4 * 4)
         else:
-            self._rho = np.zeros((n_cells, size))
-            self._slope = np.zeros((n_cells, size))
+            self._rho = lanes.zeros(n_cells, size)
+            self._slope = lanes.zeros(n_cells, size)
         self._addresses: dict[parts.Shared, int] = {}
         self._reference: Floats | None = None
         self._capacity = 6 * n_cells + 64
@@ -302,7 +302,7 @@ class Layer:
 
     def _allocate_roots(self, room: int, spare: int = 0) -> None:
         self._room = self._n_blocks * room
-        self._roots = np.zeros((self._room + spare, crossings.ROOT))
+        self._roots = lanes.zeros(self._room + spare, crossings.ROOT)
         self._sign = np.zeros(self._room + spare)
         self._of_blocks = self._roots[: self._room], self._sign[: self._room]
         self._fault = np.zeros(self._n_blocks, np.int64)

@@ -21,6 +21,7 @@ from cellquant.sim.lanes import (
     LANES,
     peek,
     poke,
+    zeros,
 )
 from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import shared
@@ -46,13 +47,13 @@ OVERFLOW = 1  # more crossings than the buffer holds
 def work(n_parts: int, size: int) -> tuple[Any, ...]:
     """Work arrays too large to be made anew at every call; `size` samples of a contour."""
     return (
-        np.zeros((n_parts, 4, LISTED), np.int64),
-        np.zeros((n_parts, 2, LISTED), np.int64),
-        np.zeros((n_parts, 3, LISTED), np.float32),
-        np.zeros((n_parts, 4, LISTED), np.float32),
-        np.zeros((n_parts, 13, LISTED), np.float32),
-        np.zeros((n_parts, 13, LISTED)),
-        np.zeros((n_parts, 2, PAIRS * (size + 5 * LANES)), np.float32),
+        zeros(n_parts, 4, LISTED, kind=np.int64),
+        zeros(n_parts, 2, LISTED, kind=np.int64),
+        zeros(n_parts, 3, LISTED, kind=np.float32),
+        zeros(n_parts, 4, LISTED, kind=np.float32),
+        zeros(n_parts, 13, LISTED, kind=np.float32),
+        zeros(n_parts, 13, LISTED),
+        zeros(n_parts, 2, PAIRS * (size + 5 * LANES), kind=np.float32),
     )
 
 

@@ -16,6 +16,7 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
@@ -23,8 +24,17 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 
 LANES = 8  # singles in a vector, and cells of a tile
 QUAD = 4  # doubles in a vector
+LINE = 64  # bytes of a cache line
 CONTRACT = ("contract", "nsz")  # products and sums may be fused; nothing else is reordered
 LOOSE = ("contract", "nsz", "arcp", "afn", "reassoc", "nnan", "ninf")
+
+
+def zeros(*shape: int, kind: Any = np.float64) -> Any:
+    """Array of zeros that starts on a cache line, so that few vectors lie across two of them."""
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    room = np.zeros(size + LINE, np.uint8)
+    start = -room.ctypes.data % LINE
+    return room[start : start + size].view(kind).reshape(shape)
 
 
 class Vector(types.Type):

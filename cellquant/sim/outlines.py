@@ -26,6 +26,7 @@ from cellquant.sim.lanes import (
     load_pair,
     peek,
     poke,
+    root,
     singles,
     store,
 )
@@ -138,20 +139,26 @@ def add_points(
         store(rays, at + 5 * LANES, (odd_a - even_a) - (even_b - odd_b))
         store(rays, at + 7 * LANES, (even_a - odd_a) - (even_b - odd_b))
     length = load_pair(sums, 0)
-    for ray in range(4 * (end - begin)):
-        at = 2 * ray * LANES
-        rho = load_pair(rays, at)
-        slope = load_pair(rays, at + LANES)
-        square = rho * rho + slope * slope
-        # 1 / sqrt: a guess to 3 %, then two steps of order three, to 3e-12.
-        inverse = halved_bits(square, GUESS)
-        for _ in range(2):
-            error = 1.0 - (square * inverse) * inverse
-            inverse += (inverse * error) * (0.5 + 0.375 * error)
-        inverse *= peek(quarter, (begin + ray // 4) * long)
-        length += square * inverse
-        store(rays, at, rho * inverse)
-        store(rays, at + LANES, slope * inverse)
+    for point in range(end - begin):
+        weight = peek(quarter, (begin + point) * long)
+        for ray in range(4):
+            at = point * row + 2 * ray * LANES
+            rho = load_pair(rays, at)
+            slope = load_pair(rays, at + LANES)
+            square = rho * rho + slope * slope
+            if ray % 2 == 1:
+                # The unit that divides would idle otherwise.
+                inverse = weight / root(square)
+            else:
+                # 1 / sqrt: a guess to 3 %, then two steps of order three, to 3e-12.
+                inverse = halved_bits(square, GUESS)
+                for _ in range(2):
+                    error = 1.0 - (square * inverse) * inverse
+                    inverse += (inverse * error) * (0.5 + 0.375 * error)
+                inverse *= weight
+            length += square * inverse
+            store(rays, at, rho * inverse)
+            store(rays, at + LANES, slope * inverse)
     store(sums, 0, length)
     sign = 1.0
     constant = load_pair(sums, LANES)
