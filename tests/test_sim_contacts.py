@@ -2,6 +2,7 @@
 
 import math
 
+import numba
 import numpy as np
 import pytest
 import shapely
@@ -268,6 +269,27 @@ def test_quadrature_of_forty_points_is_the_published_sum():
         assert out[i, 0] == pytest.approx(-np.sum(held * normal_x) * 2 * np.pi / 40, abs=1e-12)
         torque = np.sum(held * rho * slope) * 2 * np.pi / 40
         assert out[i, 2] == pytest.approx(torque, abs=1e-12)
+
+
+@pytest.mark.parametrize("contact", ["exact", "quadrature"])
+def test_forces_depend_on_no_number_of_parts_and_on_nothing_left_in_work_arrays(
+    contact, monkeypatch
+):
+    """Bit for bit, where each block of cells is a part of its own and work arrays hold garbage."""
+    scene = Scene(phi=0.85, n_cells=600)
+    rng = np.random.default_rng(1)
+    for seed in range(6):
+        state, radius, box = lively(scene, seed=seed)
+        alone = velocity(Layer(scene, radius, box, contact=contact), state)
+        layer = Layer(scene, radius, box, contact=contact)
+        monkeypatch.setattr(numba, "get_num_threads", lambda: 100)
+        velocity(layer, state)
+        for array in getattr(layer, "_work", ()):
+            if array.dtype.kind == "f":
+                array[...] = rng.normal(size=array.shape)
+        in_parts = velocity(layer, state)
+        monkeypatch.undo()
+        assert np.array_equal(in_parts, alone)
 
 
 @pytest.mark.parametrize("contact", ["exact", "quadrature"])

@@ -169,7 +169,7 @@ def judge_gaps(
         turning = choose(low > 0.0, low, high)
         value = choose(turning == t2, p2, p1)
         away = root(greatest(-value / nonzero(c2 + 3.0 * c3 * turning), 0.0))
-        chord = -g0 / nonzero(difference)
+        chord = g0 / nonzero(g0 - g1)
         t = choose(low > 0.0, turning + away, choose(high < 1.0, turning - away, chord))
         t = greatest(least(t, high), low)
         value = g0 + t * (e0 + t * (c2 + t * c3))
