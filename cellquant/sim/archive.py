@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -271,21 +272,31 @@ class Run:
         InputError
             If they cannot be decoded or are not all there.
         """
-        try:
+        with self._decoding(name):
             values = np.asarray(self._group[name][where], np.float64)
-        except Exception as error:  # whatever a decoder calls it
-            raise InputError(
-                f"{self.path or 'the run'}: {name} cannot be decoded ({_first_line(error)}); the "
-                "run is damaged: simulate it again."
-            ) from error
         # A lost file of an array reads as its fill value, NaN; times end where the run does.
-        positive = name in ("radius", "box")
-        if name != "time" and not (np.isfinite(values) & ((values > 0.0) | (not positive))).all():
+        sound = name == "time" or bool(np.isfinite(values).all())
+        if sound and name in ("radius", "box"):
+            sound = bool((values > 0.0).all())
+        elif sound and name == "modes":  # a0^2 > 0, see `Scene`
+            sound = not (np.abs(values) > 2.0).any()
+            sound = sound and bool((np.sum(values**2, axis=(-2, -1)) < 2.0).all())
+        if not sound:
             raise InputError(
                 f"{self.path or 'the run'}: {name} is incomplete; a file of it is lost or damaged: "
                 "simulate the run again."
             )
         return values
+
+    @contextmanager
+    def _decoding(self, name: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # whatever a decoder calls it
+            raise InputError(
+                f"{self.path or 'the run'}: {name} cannot be decoded ({_first_line(error)}); the "
+                "run is damaged: simulate it again."
+            ) from error
 
     def _frames(self, name: str) -> Floats:
         return self.read(name, slice(self.n_frames))
@@ -300,7 +311,8 @@ class Run:
 
     def stretches(self) -> Iterator[slice]:
         """Successive frames that lie together on disk, all frames in turn."""
-        size = int(self._group["modes"].chunks[0])
+        with self._decoding("modes"):
+            size = int(self._group["modes"].chunks[0])
         for start in range(0, self.n_frames, size):
             yield slice(start, min(start + size, self.n_frames))
 
