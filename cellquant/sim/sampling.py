@@ -32,7 +32,7 @@ from cellquant.sim.lanes import (
     trailing_zeros,
 )
 
-PAIRS = 40  # pairs whose contours are sampled before the gaps between samples are judged
+PAIRS = 112  # pairs whose contours are sampled before the gaps between samples are judged
 MANY = 12  # gaps of one pair that may hold a crossing; with more it is searched in double precision
 CLOSELY, OUTSIDE, INSIDE = -1, -2, -3  # what a pair without gaps is
 END = np.uint64(1 << 63)
