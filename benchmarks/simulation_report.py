@@ -174,9 +174,8 @@ def main():
     if extreme:
         parts.append("## Extreme scenes\n")
         parts.append(
-            "Sixteen cells (or as named) for 20 t0, by the implicit scheme with steps of 0.1 and "
-            "with adaptive steps (tolerance 1e-3). Measured before the present kernels, and before "
-            "the usual step became shorter for cells faster than 0.03. Errors are RMS distances "
+            "Sixteen cells (or as named) for 20 t0, by the implicit scheme with its usual step "
+            "and with adaptive steps (tolerance 1e-3). Errors are RMS distances "
             "of the centres after about 1 t0 to a run with tolerance 1e-5 on the same Brownian "
             "path, whose own error is that to tolerance 3e-5; rigid discs: Euler steps 64 times "
             "as short. `repaired` steps were taken in parts. <p> is the mean over the last 10 t0: "
