@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -112,7 +112,8 @@ def track(
         Linker, typer.Option(help="'trackpy' is the plain nearest-neighbour baseline.")
     ] = Linker.cues,
     export: Annotated[
-        TrackFormat | None, typer.Option(help="Also write DIR/ctc, a CTC folder.")
+        Literal["ctc"] | None,
+        typer.Option(help="Also write DIR/ctc, a CTC folder; 'cellquant export' writes others."),
     ] = None,
     progress: ProgressOption = Progress.auto,
 ) -> None:
@@ -121,10 +122,6 @@ def track(
     from cellquant.io import read_images, read_labels
     from cellquant.pipeline import track_movie
 
-    if export not in (None, TrackFormat.ctc):
-        raise InputError(
-            f"--export writes ctc only, got {export}; for other formats use 'cellquant export'."
-        )
     stack = read_labels(masks, **_calibration(pixel_size, frame_interval, units))
     options: dict[str, Any] = {
         "max_distance": max_distance,
@@ -137,7 +134,7 @@ def track(
         output,
         raw=None if raw is None else read_images(raw),
         options=options,
-        export_ctc=export is TrackFormat.ctc,
+        export_ctc=export is not None,
         step=step,
     )
     for line in track_lines(stack, cells, tracks):
