@@ -26,8 +26,8 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "scale.json"
 PAGE = HERE.parent / "docs" / "scale.md"
 END = "<!-- end -->"
-FRAMES = (50, 100, 1000)  # the first two are fitted, the last is ten times the second
-TIMES = (50, 100, 1000)
+FRAMES = (200, 400, 4000)  # the first two are fitted, the last is ten times the second
+TIMES = (200, 400, 4000)
 SWEEP = """
 seeds = [1, 2]
 [scene]

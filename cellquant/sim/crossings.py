@@ -28,8 +28,8 @@ from cellquant.sim.parts import shared
 from cellquant.sim.polishing import TWO, UNSURE, judge_gaps, polish
 from cellquant.sim.sampling import (
     CLOSELY,
+    FULL,
     INSIDE,
-    MANY,
     OUTSIDE,
     PAIRS,
     find_windows,
@@ -38,7 +38,7 @@ from cellquant.sim.sampling import (
 )
 
 ROOT = 8  # columns of a root: unit vectors on i and on j, rho on i and on j, error, angle
-LISTED = PAIRS * 4 * MANY + 4 * LANES  # gaps, second crossings, and what to polish again
+LISTED = 4 * FULL + 4 * LANES  # gaps, second crossings, and what to polish again
 NARROW = 0.1  # smallest radius over A0 for which single precision is trusted
 SETTLED = 2e-9  # error of an angle that needs no further steps
 OVERFLOW = 1  # more crossings than the buffer holds

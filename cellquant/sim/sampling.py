@@ -34,6 +34,7 @@ from cellquant.sim.lanes import (
 
 PAIRS = 112  # pairs whose contours are sampled before the gaps between samples are judged
 MANY = 12  # gaps of one pair that may hold a crossing; with more it is searched in double precision
+FULL = 4 * PAIRS  # gaps of all of them; pairs for which there is no room are searched in it too
 CLOSELY, OUTSIDE, INSIDE = -1, -2, -3  # what a pair without gaps is
 END = np.uint64(1 << 63)
 TINY = 1e-30
@@ -177,7 +178,7 @@ def list_gaps(
             if s + 2 * LANES > last:
                 word &= (np.uint64(1) << np.uint64(last - s)) - np.uint64(1)
             number = count_ones(word)
-            if base - first + number > MANY:
+            if base - first + number > MANY or base + number > FULL:
                 codes[pair] = CLOSELY
                 base = first
                 break
