@@ -100,10 +100,8 @@ def measure(path):
 def pinched_share(run):
     from cellquant.sim.shapes import pinched
 
-    modes, polarity = run.modes, run.polarity
-    return np.array(
-        [pinched(modes[t], polarity[t], run.radius).mean() for t in range(run.n_frames)]
-    )
+    modes = run.modes
+    return np.array([pinched(modes[t]).mean() for t in range(run.n_frames)])
 
 
 def tabulate(rows):

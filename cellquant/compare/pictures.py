@@ -221,19 +221,12 @@ def contours_of(
     run: "Run", *, frame: int = -1, points: int = 32
 ) -> tuple[FloatArray, tuple[float, float]]:
     """Contours (N, K, 2) of the cells in a saved state of a run, by default the last; its box."""
-    angle = 2 * np.pi * np.arange(points) / points
-    modes = np.asarray(run.modes[frame], dtype=np.float64)
-    n = np.arange(2, modes.shape[-1] + 2)
-    radius = np.asarray(run.radius, dtype=np.float64)
-    a0 = np.sqrt(1 - 0.5 * (modes**2).sum(axis=(1, 2)))
-    shape = a0[:, None] + modes[:, 0] @ np.cos(np.outer(n, angle))
-    shape = shape + modes[:, 1] @ np.sin(np.outer(n, angle))
-    direction = angle[None] + np.asarray(run.polarity[frame], dtype=np.float64)[:, None]
-    reach = radius[:, None] * shape
-    offsets = np.stack([reach * np.cos(direction), reach * np.sin(direction)], axis=-1)
-    contours: FloatArray = np.asarray(run.position[frame], dtype=np.float64)[:, None] + offsets
+    from cellquant.sim.shapes import contours
+
+    polarity, radius = run.polarity[frame], run.radius
+    outlines = contours(run.position[frame], run.modes[frame], polarity, radius, points)
     box = np.asarray(run.box, dtype=np.float64)
-    return contours, (float(box[0]), float(box[1]))
+    return outlines, (float(box[0]), float(box[1]))
 
 
 def thin_paths(table: "pd.DataFrame", *, max_points: int = MAX_POINTS) -> "pd.DataFrame":

@@ -1,5 +1,6 @@
 """The layer at work: buffers, neighbour list and the choice of the compiled contact rule."""
 
+import math
 from typing import Any, Literal
 
 import numba
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from cellquant.errors import InputError
 from cellquant.sim import (
+    areas,
     crossings,
     discs,
     lanes,
@@ -24,8 +26,6 @@ from cellquant.sim.scene import Scene, SimulationFailure
 Floats = NDArray[np.float64]
 ContactRule = Literal["exact", "quadrature"]
 NONE = np.empty(0, np.int64)
-NO_SHAPE = "the contour is no longer representable (a0^2 <= 0)"
-DRAWN_OUT = "the cell is drawn out too far: take a larger eta, or a smaller v0 or phi"
 PINCHED = 0.02  # smallest sample of a contour over R0 below which its zeros are sought
 
 
@@ -90,6 +90,8 @@ class Layer:
         spare = lanes.QUAD - 1  # rows that the last tile of cells may write to
         self._record = lanes.zeros(n_cells + spare, records.record_length(n_modes))[:n_cells]
         self._energy = np.zeros(n_cells)
+        self._growth = np.zeros(n_cells)  # dH/dA0
+        self._parted, self._pulls = NONE, np.empty((0, 2 * n_modes))
         if contact == "exact":
             self._single = single
             self._work = crossings.work(1, size)
@@ -122,7 +124,7 @@ class Layer:
         Raises
         ------
         SimulationFailure
-            If a contour is not representable (a0^2 <= 0), or a number is not finite.
+            If a number is not finite.
         """
         for array in (state, out):  # compiled code is given their addresses
             if array.dtype != np.float64 or not array.flags.c_contiguous:
@@ -143,7 +145,7 @@ class Layer:
                 (
                     state, self.radius, self._record, self._tangent, self._first, self._other,
                     *back, self._roots, self._root_first, self._root_last, self._sign,
-                    self._inside, self._numbers, out, self._energy,
+                    self._inside, self._numbers, out, self._energy, self._growth,
                 ),
                 self._modes,
                 self._tension,
@@ -154,11 +156,16 @@ class Layer:
                 quadrature.quadrature_velocity,
                 (
                     state, self.radius, self._record, self._rho, self._slope, self._table,
-                    *common, *back, self._numbers, out,
+                    *common, *back, self._numbers, out, self._growth,
                 ),
                 self._modes,
                 self._tension,
                 self._torque,
+            )  # fmt: skip
+        if len(self._parted):
+            areas.correct_velocity(
+                self._record, self._parted, self._pulls, self.radius, self._growth,
+                self.scene.mu_ab, len(self._modes), out,
             )  # fmt: skip
 
     def energies(self, state: Floats) -> Floats:
@@ -221,12 +228,12 @@ class Layer:
         fresh = self._reference is None
         reference = self._record[:, [0, 1, 3]] if self._reference is None else self._reference
         age, fault, narrowest = neighbours.inspect(self._record, reference)
+        self._narrow = self._parted = NONE
+        if (fault >= 0 or narrowest < 2.0 * pinches.NARROW) and not self.scene.rigid:
+            self._keep_areas()
+            age, fault, _ = neighbours.inspect(self._record, reference)
+            self._narrow = np.flatnonzero(self._record[:, 4] < pinches.NARROW * self.radius)
         self._check(fault)
-        self._narrow = (
-            np.flatnonzero(self._record[:, 4] < pinches.NARROW * self.radius)
-            if narrowest < 2.0 * pinches.NARROW and not self.scene.rigid
-            else NONE
-        )
         if len(self._narrow) and tension:
             pinches.measure_lengths(self._record, self._narrow, len(self._modes), self._tangent)
         if fresh or age > 0.5 * self.skin:
@@ -250,15 +257,41 @@ class Layer:
             parts.share(address, self._n_parts, arrays, *features)
 
     def _check(self, fault: int) -> None:
-        if fault < 0:
-            return
-        row = self._record[fault]
-        reason = "the state is not finite"
-        remedy = "take a smaller step or the adaptive integrator"
-        modes = row[records.HEAD : records.HEAD + 2 * len(self._modes)]
-        if np.isfinite(row[:2]).all() and np.isfinite(modes).all():
-            reason, remedy = NO_SHAPE, DRAWN_OUT
-        raise SimulationFailure(reason, remedy, cell=fault)
+        if fault >= 0:
+            raise SimulationFailure(
+                "the state is not finite",
+                "take a smaller step or the adaptive integrator",
+                cell=fault,
+            )
+
+    def _keep_areas(self) -> None:
+        """Mean radius, samples and bounds of contours with gaps, whose closed form differs."""
+        n_modes = len(self._modes)
+        cells = np.flatnonzero(~(self._record[:, 4] >= PINCHED * self.radius))
+        pulls = np.empty((len(cells), 2 * n_modes))
+        parted = areas.keep_areas(self._record, self.radius, n_modes, cells, pulls)
+        self._parted, self._pulls = cells[parted], pulls[parted]
+        size = self._table.shape[1]
+        spacing = 2.0 * math.pi / size
+        for i in self._parted:
+            if self.contact == "exact":
+                rho, slope = np.empty(size), np.empty(size)
+                areas.resample(self._record, i, self.radius[i], n_modes, rho, slope, spacing)
+                self._fill_grid(i, rho, slope)
+            else:
+                areas.resample(
+                    self._record, i, self.radius[i], n_modes, self._rho[i], self._slope[i], spacing
+                )
+
+    def _fill_grid(self, i: int, rho: Floats, slope: Floats) -> None:
+        """Write a contour sampled anew to what the search of crossings reads."""
+        row = self._grid.shape[2]
+        self._grid[i] = np.resize(rho, row), np.resize(slope, row)
+        n_modes = len(self._modes)
+        modes = self._record[i, records.HEAD : records.HEAD + 2 * n_modes]
+        self._pattern[i, 0] = self._record[i, 2]
+        self._pattern[i, 1 : 1 + 2 * n_modes] = modes
+        self._pattern[i, 1 + 2 * n_modes :] = np.tile(np.arange(2, n_modes + 2), 2) * modes
 
     def _rebuild(self) -> None:
         position = np.ascontiguousarray(self._record[:, :2])

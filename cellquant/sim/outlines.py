@@ -329,7 +329,7 @@ def contours(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, tor
     `pattern` A0, the modes and n times the modes, both in single precision, and in `tangent` the
     length, L_0, then Re and Im of
     L_n = integral (u + i n v) exp(i n phi), u = rho / |t|, v = slope / |t|. The lower estimate of
-    rho is NaN where a0^2 <= 0.
+    rho is NaN where A0 is, see `areas`.
     """
     state, radius, compass, quarter, starts, record, grid, pattern, tangent = arrays
     n_modes = len(modes)

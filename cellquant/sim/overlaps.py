@@ -117,8 +117,8 @@ def shape_forces(
 ) -> None:
     """Convolve W with the modes, for a tile of cells.
 
-    Rows of `lane`: see `fill_lanes`. Rows of `out`: the overlap integral, then dH/da_n and dH/db_n
-    over R0. `inverse` holds 1 and 1 / n.
+    Rows of `lane`: see `fill_lanes`. Rows of `out`: the overlap integral, dH/da_n and dH/db_n over
+    R0, then dH/dA0. `inverse` holds 1 and 1 / n.
     """
     n_modes = len(modes)
     half = (2 * n_modes + 3) * QUAD
@@ -176,19 +176,20 @@ def shape_forces(
         store(out, (1 + m) * QUAD, jr * cos_n + ji * sin_n)
         store(out, (1 + n_modes + m) * QUAD, ji * cos_n - jr * sin_n)
     store(out, 0, area)
+    store(out, (1 + 2 * n_modes) * QUAD, constant)
 
 
 @shared(FLAGS)
 def exact_velocity(
     part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
 ) -> None:
-    """Generalised velocity and energy of every cell from the crossings of its contour.
+    """Generalised velocity, energy and dH/dA0 of every cell from the crossings of its contour.
 
     `numbers` holds v0, k, eta, mu_r, mu_theta, mu_ab.
     """
     (
         state, radius, record, tangent, first, second, back_first, back_pair, back_cell, roots,
-        root_first, root_last, sign, inside, numbers, velocity, energy,
+        root_first, root_last, sign, inside, numbers, velocity, energy, growth,
     ) = arrays  # fmt: skip
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
@@ -200,7 +201,7 @@ def exact_velocity(
     tile = np.empty(2 * n_powers * QUAD)
     lane = np.empty((12 + 4 * n_modes) * QUAD)
     rows = np.empty(2 * QUAD, np.int64)
-    out = np.empty((1 + 2 * n_modes) * QUAD)
+    out = np.empty((2 + 2 * n_modes) * QUAD)
     lens = np.empty(QUAD)
     rest = np.zeros(2 * QUAD)
     side = np.zeros(3 * SLOTS * QUAD)
@@ -321,3 +322,4 @@ def exact_velocity(
                     velocity[i, 3 + m] = -scale * out[(1 + m) * QUAD + column]
                 bound = eta * tangent[i, 0] if len(tension) > 0 else 0.0
                 energy[i] = bound + k * (0.5 * out[column] + lens[column])
+                growth[i] = out[(1 + 2 * n_modes) * QUAD + column]

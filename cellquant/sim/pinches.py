@@ -1,9 +1,9 @@
 r"""Cells whose contour pinches at its centre, and the exact rule for them.
 
 A cell is the set of points with r < R(phi). It has no extent in directions with R(phi) <= 0: there
-its contour passes through its centre, and the cell consists of lobes that meet there. The energy
-stays continuously differentiable across the pinch: its overlap areas change by R dR and its length
-by an integrand that is small where R and dR/dphi are both small.
+its contour passes through its centre, and the cell consists of lobes that meet there, whose area is
+kept (see `areas`). The energy stays continuously differentiable across the pinch: its overlap areas
+change by R dR and its length by an integrand that is small where R and dR/dphi are both small.
 
 For such cells the arcs inside a neighbour also end where R = 0, if the neighbour holds the centre.
 These ends stand among the crossings of a pair as entries of one cell alone: their radius is zero,
@@ -33,30 +33,52 @@ def radius_towards(record: Any, i: int, angle: float, n_modes: int) -> tuple[flo
     """R and dR/dphi of a contour in one direction."""
     rho = record[i, 2]
     slope = 0.0
+    cos_1 = math.cos(angle)
+    sin_1 = math.sin(angle)
+    c = cos_1
+    s = sin_1
     for m in range(n_modes):
-        n = m + 2
-        c = math.cos(n * angle)
-        s = math.sin(n * angle)
+        c, s = c * cos_1 - s * sin_1, s * cos_1 + c * sin_1
         re = record[i, HEAD + m]
         im = record[i, HEAD + n_modes + m]
         rho += re * c - im * s
-        slope -= n * (re * s + im * c)
+        slope -= (m + 2) * (re * s + im * c)
     return rho, slope
 
 
 @njit(cache=True, error_model="numpy")
-def bisect(record: Any, i: int, low: float, high: float, n_modes: int, of_slope: bool) -> float:
-    """The zero of R, or of dR/dphi, between two angles with values of different sign."""
-    rho, slope = radius_towards(record, i, low, n_modes)
-    start = slope > 0.0 if of_slope else rho > 0.0
+def least_between(record: Any, i: int, low: float, high: float, n_modes: int) -> float:
+    """The zero of dR/dphi between two angles where it has different signs, by bisection."""
+    _, start = radius_towards(record, i, low, n_modes)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        rho, slope = radius_towards(record, i, middle, n_modes)
-        if (slope > 0.0 if of_slope else rho > 0.0) == start:
+        _, slope = radius_towards(record, i, middle, n_modes)
+        if (slope > 0.0) == (start > 0.0):
             low = middle
         else:
             high = middle
     return 0.5 * (low + high)
+
+
+@njit(cache=True, error_model="numpy")
+def zero_between(record: Any, i: int, low: float, high: float, n_modes: int) -> float:
+    """The zero of R between two angles where it has different signs, by Newton and bisection."""
+    rho, _ = radius_towards(record, i, low, n_modes)
+    positive = rho > 0.0
+    angle = 0.5 * (low + high)
+    for _ in range(60):
+        rho, slope = radius_towards(record, i, angle, n_modes)
+        if (rho > 0.0) == positive:
+            low = angle
+        else:
+            high = angle
+        guess = angle - rho / slope if slope != 0.0 else low
+        if not low < guess < high:
+            guess = 0.5 * (low + high)
+        if abs(guess - angle) <= 4e-16:
+            break
+        angle = guess
+    return angle
 
 
 @njit(cache=True, error_model="numpy")
@@ -76,7 +98,7 @@ def gaps(record: Any, i: int, n_modes: int, ends: Any) -> int:
             slope_0 < 0.0 < slope_1 if rho_0 > 0.0 else slope_0 > 0.0 > slope_1
         )
         if hidden:
-            marks[1] = bisect(record, i, low, low + spacing, n_modes, True)
+            marks[1] = least_between(record, i, low, low + spacing, n_modes)
             n_parts = 2
         marks[n_parts] = low + spacing
         before = rho_0
@@ -85,7 +107,7 @@ def gaps(record: Any, i: int, n_modes: int, ends: Any) -> int:
             if part < n_parts - 1:
                 after, _ = radius_towards(record, i, marks[part + 1], n_modes)
             if (before > 0.0) != (after > 0.0) and count < ends.shape[0]:
-                ends[count] = bisect(record, i, marks[part], marks[part + 1], n_modes, False)
+                ends[count] = zero_between(record, i, marks[part], marks[part + 1], n_modes)
                 count += 1
             before = after
         rho_0, slope_0 = rho_1, slope_1

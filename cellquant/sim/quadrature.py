@@ -132,7 +132,7 @@ def quadrature_velocity(
     """
     (
         state, radius, record, rho, slope, table, first, other, shift, back_first, back_pair,
-        back_cell, numbers, velocity,
+        back_cell, numbers, velocity, growth,
     ) = arrays  # fmt: skip
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
@@ -235,6 +235,7 @@ def quadrature_velocity(
                     odd_slope[s] = v[s] - v[s + half]
             cos_1 = record[i, 5]
             sin_1 = record[i, 6]
+            growth[i] = spacing * constant
             pull = 0.5 * constant * radius[i] / record[i, 2]
             scale = spacing * mu_ab * radius[i]
             cos_n = cos_1

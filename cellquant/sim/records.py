@@ -57,7 +57,7 @@ def write_records(
 ) -> None:  # fmt: skip
     """Records of a tile of cells, with R0 sum n^2 |C_n| / R0 in place of the largest radius.
 
-    A0 is NaN where it is not a number, and so is the lower estimate of rho everywhere.
+    A0 is that of the closed form, NaN where it has none; the lower estimate of rho is NaN.
     """
     n_modes = len(modes)
     n_columns = state.shape[1]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cellquant.errors import InputError
 from cellquant.io import LabelStack, read_labels, write_ctc, write_labels
 from cellquant.sim.archive import Run
-from cellquant.sim.shapes import contours, measure_shapes
+from cellquant.sim.shapes import contours, mean_radii, measure_shapes
 from cellquant.storage import atomic_path
 from cellquant.tables import PHYSICAL, TRACK_COLUMNS, Tracks
 
@@ -50,8 +50,8 @@ class Rendering:
 
 @njit(cache=True, error_model="numpy")
 def draw(
-    position: Any, theta: Any, radius: Any, modes: Any, pixel: float, texture: Any, out: Any,
-    nearest: Any, shade: Any,
+    position: Any, theta: Any, radius: Any, mean: Any, modes: Any, pixel: float, texture: Any,
+    out: Any, nearest: Any, shade: Any,
 ) -> None:  # fmt: skip
     """Draw cells (already shifted into the field) into `out` as index plus one.
 
@@ -63,18 +63,15 @@ def draw(
     re = np.empty(n_modes)
     im = np.empty(n_modes)
     for i in range(position.shape[0]):
-        power = 0.0
         largest = 0.0
         for m in range(n_modes):
             a = modes[i, 0, m]
             b = modes[i, 1, m]
-            power += a * a + b * b
             largest += math.sqrt(a * a + b * b)
             angle = (m + 2) * theta[i]
             re[m] = a * math.cos(angle) - b * math.sin(angle)
             im[m] = -b * math.cos(angle) - a * math.sin(angle)
-        mean = math.sqrt(1.0 - 0.5 * power)
-        reach = HALO * radius[i] * (mean + largest)
+        reach = HALO * radius[i] * (abs(mean[i]) + largest)
         x0 = position[i, 0]
         y0 = position[i, 1]
         top = max(0, math.ceil((y0 - reach) / pixel))
@@ -93,7 +90,7 @@ def draw(
                     s = y / r
                 zr = c
                 zi = s
-                bound = mean
+                bound = mean[i]
                 for m in range(n_modes):
                     zr, zi = zr * c - zi * s, zr * s + zi * c
                     bound += re[m] * zr - im[m] * zi
@@ -255,6 +252,7 @@ class _Painter:
             np.ascontiguousarray(place),
             state[cells, 2],
             self.run.radius[cells],
+            mean_radii(modes[cells]),
             np.ascontiguousarray(modes[cells]),
             self.pixel,
             self.texture[cells],

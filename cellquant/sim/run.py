@@ -292,7 +292,7 @@ class _Simulation:
     def _count_pinched(self) -> None:
         if not self.scene.rigid:
             modes = self.state[:, 3:].reshape(len(self.state), 2, -1)
-            self.pinched += pinched(modes, self.state[:, 2], self.layer.radius)
+            self.pinched += pinched(modes)
 
     def _write_frames(self) -> None:
         if self.buffer:

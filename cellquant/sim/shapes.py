@@ -6,6 +6,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from cellquant.sim import areas
+from cellquant.sim.records import HEAD, record_length
+
 Floats = NDArray[np.float64]
 _BATCH = 256  # contours at a time: their points stay in the cache
 
@@ -25,21 +28,37 @@ def contour_radii(
     n = np.arange(2, modes.shape[2] + 2)
     turned = (modes[:, 0] - 1j * modes[:, 1]) * np.exp(-1j * np.outer(polarity, n))
     phase = np.exp(2j * math.pi * np.outer(n, np.arange(points)) / points)
-    mean = np.sqrt(1.0 - 0.5 * np.sum(modes**2, axis=(1, 2)))
-    rho = mean[:, None] + (turned @ phase).real
+    rho = mean_radii(modes)[:, None] + (turned @ phase).real
     slope = ((turned * (1j * n)) @ phase).real
     return rho * radius[:, None], slope * radius[:, None]
 
 
-def pinched(modes: Floats, polarity: Floats, radius: Floats) -> NDArray[np.bool_]:
-    """(N,) whether R(phi) <= 0 somewhere, on 128 directions: the cell has parted into lobes."""
-    squares = np.sum(modes**2, axis=1)
-    near = np.flatnonzero(np.sqrt(squares).sum(axis=1) > np.sqrt(1.0 - 0.5 * squares.sum(axis=1)))
-    found = np.zeros(len(radius), bool)
-    if len(near):
-        rho, _ = contour_radii(modes[near], polarity[near], radius[near], 128)
-        found[near] = rho.min(axis=1) <= 0.0
+def mean_radii(modes: Floats) -> Floats:
+    """(N,) mean radius a0 over R0 that keeps the area of the set r < R: see `areas`."""
+    mean, cells, record = _keep_areas(modes)
+    mean[cells] = record[:, 2]
+    return mean
+
+
+def pinched(modes: Floats) -> NDArray[np.bool_]:
+    """(N,) whether R(phi) < 0 somewhere: the cell has parted into lobes."""
+    found = np.zeros(len(modes), bool)
+    found[_keep_areas(modes)[1]] = True
     return found
+
+
+def _keep_areas(modes: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """(N,) a0 of the closed form; pinched cells, and their records with R0 = 1 and theta = 0."""
+    mean: Floats = np.sqrt(np.maximum(1.0 - 0.5 * np.sum(modes**2, axis=(1, 2)), 0.0))
+    near = np.flatnonzero(np.sqrt(np.sum(modes**2, axis=1)).sum(axis=1) >= mean)
+    n_modes = modes.shape[2]
+    record = np.zeros((len(near), record_length(n_modes)))
+    record[:, HEAD : HEAD + n_modes] = modes[near, 0]
+    record[:, HEAD + n_modes : HEAD + 2 * n_modes] = -modes[near, 1]
+    weights = np.empty((len(near), 2 * n_modes))
+    one, all_of_them = np.ones(len(near)), np.arange(len(near))
+    parted = areas.keep_areas(record, one, n_modes, all_of_them, weights)
+    return mean, near[parted], record[parted]
 
 
 def contours(
@@ -64,14 +83,16 @@ def shape_indices(modes: Floats) -> Floats:
         rho, slope = _terms(modes[start : start + _BATCH], n, waves)
         length = np.sqrt(rho * rho + slope * slope).sum(axis=1)
         found.append(length * (2.0 * math.pi / rho.shape[1] / math.sqrt(math.pi)))
-    return np.concatenate(found or [np.empty(0)])
+    index = np.concatenate(found or [np.empty(0)])
+    cells, lobes = _lobes(modes)
+    index[cells] = lobes[:, 0] / np.sqrt(lobes[:, 1])
+    return index
 
 
 def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFrame:
     r"""Area, perimeter and axes of every contour by the trapezoid rule, which is spectral here.
 
-    Of a pinched cell (R < 0 somewhere, see `pinches`) the perimeter is the length of the whole
-    Fourier contour, as in the energy, and the area pi R0^2, as the model keeps it.
+    A pinched cell (R < 0 somewhere, see `pinches`) is the set r < R: its lobes are measured.
 
     .. math:: P = \int \sqrt{\rho^2 + \rho'^2}\, d\phi, \qquad p = P / \sqrt{A}
 
@@ -91,7 +112,10 @@ def measure_shapes(modes: Floats, polarity: Floats, radius: Floats) -> pd.DataFr
     parts = [
         _moments(modes[start : start + _BATCH], n, waves) for start in range(0, len(radius), _BATCH)
     ]
-    length, square, x, y, xx, yy, xy = np.concatenate(parts or [np.empty((0, 7))]).T
+    moments = np.concatenate(parts or [np.empty((0, 7))])
+    cells, lobes = _lobes(modes)
+    moments[cells] = _central(*lobes.T)
+    length, square, x, y, xx, yy, xy = moments.T
     # In the frame of the polarity and in units of R0 so far.
     area, perimeter = square * radius**2, length * radius
     c, s = np.cos(polarity), np.sin(polarity)
@@ -126,7 +150,7 @@ def _terms(modes: Floats, n: Floats, waves: tuple[Floats, Floats]) -> tuple[Floa
     """
     even, odd = waves
     a, b = modes[:, 0, :, None], modes[:, 1, :, None]
-    rho = np.repeat(np.sqrt(1.0 - 0.5 * np.sum(modes**2, axis=(1, 2)))[:, None], even.shape[1], 1)
+    rho = np.repeat(mean_radii(modes)[:, None], even.shape[1], 1)
     slope = np.zeros_like(rho)
     for k, order in enumerate(n):
         rho += a[:, k] * even[k] + b[:, k] * odd[k]
@@ -144,6 +168,21 @@ def _moments(modes: Floats, n: Floats, waves: tuple[Floats, Floats]) -> Floats:
     area = 0.5 * d * square.sum(axis=1)
     length = d * np.sqrt(square + slope * slope).sum(axis=1)
     cube, fourth = rho * square, square * square
-    x, y = (d / 3.0 * (cube * wave).sum(axis=1) / area for wave in (c, s))
-    xx, yy, xy = (0.25 * d * (fourth * w).sum(axis=1) / area for w in (c * c, s * s, c * s))
-    return np.column_stack([length, area, x, y, xx - x * x, yy - y * y, xy - x * y])
+    x, y = (d / 3.0 * (cube * wave).sum(axis=1) for wave in (c, s))
+    xx, yy, xy = (0.25 * d * (fourth * w).sum(axis=1) for w in (c * c, s * s, c * s))
+    return _central(length, area, x, y, xx, xy, yy)
+
+
+def _central(
+    length: Floats, area: Floats, x: Floats, y: Floats, xx: Floats, xy: Floats, yy: Floats
+) -> Floats:  # fmt: skip
+    """(N, 7) perimeter, area, centre of mass and central moments from plain integrals."""
+    x, y = x / area, y / area
+    second = (xx / area - x * x, yy / area - y * y, xy / area - x * y)
+    return np.column_stack([length, area, x, y, *second])
+
+
+def _lobes(modes: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Pinched cells, and what `areas.measure` finds for them, with R0 = 1 and theta = 0."""
+    _, cells, record = _keep_areas(modes)
+    return cells, areas.measure(record, np.arange(len(cells)), modes.shape[2])

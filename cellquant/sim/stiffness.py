@@ -136,7 +136,7 @@ def gather(
             square = scale[0] * scale[0] + turning * turning
             if n_modes > 0:
                 radial = radius * rho * inverse * scale[3]
-                half = 0.5 / mean
+                half = 0.5 / greatest(mean, 0.2 * radius)
                 zr = c
                 zi = s
                 for m in range(n_modes):
