@@ -394,7 +394,7 @@ def test_a_run_goes_on_past_a_pinched_cell_and_says_so(tmp_path, monkeypatch):
 
 
 def test_a_run_goes_on_where_the_closed_form_of_a0_ends():
-    """Cells drawn out until sum(a_n^2 + b_n^2) / 2 > 1 keep their area, and stay of finite length."""
+    """Cells drawn out until sum(a_n^2 + b_n^2) / 2 > 1 keep their area and a finite length."""
     run = simulate(DRAWN_OUT, duration=40)
     assert run.n_frames == 41
     assert (0.5 * np.sum(run.modes[:] ** 2, axis=(2, 3))).max() > 1.0

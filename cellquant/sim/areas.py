@@ -28,7 +28,7 @@ LEAST_MEAN = 1e-6  # |A0| over R0 below which the closed form of the forces is n
 
 @njit(cache=True, error_model="numpy")
 def moments_of_gaps(record: Any, i: int, n_modes: int, ends: Any, n_ends: int, out: Any) -> float:
-    """Integrals over the gaps: of R^2 / 2, returned, and in `out` of R, R cos n phi, R sin n phi."""
+    """Integrals over gaps: of R^2 / 2, returned, and in `out` of R, R cos n phi and R sin n phi."""
     out[:] = 0.0
     area = 0.0
     for e in range(0, n_ends, 2):
@@ -82,9 +82,7 @@ def keep_area(record: Any, i: int, radius: float, n_modes: int, weights: Any) ->
         re = record[i, HEAD + m]
         im = record[i, HEAD + n_modes + m]
         weights[m] = (math.pi * re - moments[1 + m]) / around - 0.5 * re / mean
-        weights[n_modes + m] = (
-            0.5 * im / mean - (math.pi * im + moments[1 + n_modes + m]) / around
-        )
+        weights[n_modes + m] = 0.5 * im / mean - (math.pi * im + moments[1 + n_modes + m]) / around
     return True
 
 

@@ -273,7 +273,7 @@ class Layer:
         self._parted, self._pulls = cells[parted], pulls[parted]
         size = self._table.shape[1]
         spacing = 2.0 * math.pi / size
-        for i in self._parted:
+        for i in self._parted.tolist():
             if self.contact == "exact":
                 rho, slope = np.empty(size), np.empty(size)
                 areas.resample(self._record, i, self.radius[i], n_modes, rho, slope, spacing)
