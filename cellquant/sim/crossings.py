@@ -213,7 +213,7 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                     if n_samples > size and within:
                         inside[p] = 1
                     elif reach < record[owner[k], 3]:
-                        inner, _, _, _, _, _ = gap(
+                        inner, _, _, _, _, _, _ = gap(
                             record, other[p], owner[k], -apart[k, 0], -apart[k, 1], 1.0, 0.0,
                             modes,
                         )  # fmt: skip

@@ -1,8 +1,8 @@
 """The depth of one contour in another, and crossings that single precision cannot settle.
 
 Where an extremum of the depth comes too close to zero, contours nearly coincide or a waist is
-narrow, gaps between samples are halved in double precision until the cubic through their ends
-decides how often it crosses zero.
+narrow, or the highest modes are large, gaps between samples are halved in double precision until
+the cubic through their ends decides how often it crosses zero.
 """
 
 import math
@@ -21,10 +21,11 @@ LEAST_STEP = 1e-13  # of an angle
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def gap(
     record: Any, i: int, j: int, dx: float, dy: float, cosine: float, sine: float, modes: Any
-) -> tuple[float, float, float, float, float, float]:
+) -> tuple[float, float, float, float, float, float, float]:
     """Depth g of the contour point of i at direction (cosine, sine) inside j, and dg/dphi.
 
-    Also rho of i, the distance to the centre of j, and the direction from it.
+    Also rho of i, the distance to the centre of j, the direction from it, and the squared length of
+    the tangent of i.
     """
     top = len(modes) - 1
     pr = record[i, HEAD + top]
@@ -64,7 +65,7 @@ def gap(
     distance = (x * x + y * y) * inverse
     depth = record[j, 2] + pr * zr - pi * zi - distance
     change = slope_j * (ux * ty - uy * tx) * inverse - (ux * tx + uy * ty)
-    return depth, change, rho, distance, ux, uy
+    return depth, change, rho, distance, ux, uy, tx * tx + ty * ty
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
@@ -94,7 +95,7 @@ def settle(
         angle = 0.5 * (low + high)
     for _ in range(80):
         c, s = turn(cosine, sine, angle)
-        g, rate, _, _, _, _ = gap(record, i, j, dx, dy, c, s, modes)
+        g, rate, _, _, _, _, _ = gap(record, i, j, dx, dy, c, s, modes)
         if (g > 0.0) == (sign > 0.0):
             low = angle
         else:
@@ -107,7 +108,7 @@ def settle(
         if step < LEAST_STEP or high - low < 1e-15:
             break
     c, s = turn(cosine, sine, angle)
-    _, _, rho, distance, ux, uy = gap(record, i, j, dx, dy, c, s, modes)
+    _, _, rho, distance, ux, uy, _ = gap(record, i, j, dx, dy, c, s, modes)
     roots[row, 0] = c
     roots[row, 1] = s
     roots[row, 2] = ux
@@ -134,6 +135,17 @@ def variations(g0: float, g1: float, d0: float, d1: float, width: float, margin:
     return 2 if max(b1, b2) > -margin else 0
 
 
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+def fourth_derivative(record: Any, i: int, modes: Any) -> float:
+    """Bound sum (n + 1)^4 |C_n| of the fourth derivative of a contour by the direction."""
+    total = 0.0
+    for m in range(len(modes)):
+        n = m + 3.0
+        size = math.hypot(record[i, HEAD + m], record[i, HEAD + len(modes) + m])
+        total += n * n * n * n * size
+    return total
+
+
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def search_closely(
     record: Any, i: int, j: int, dx: float, dy: float, compass: Any, start: int, count: int,
@@ -148,24 +160,36 @@ def search_closely(
     size = compass.shape[1]
     spacing = 2.0 * math.pi / size
     whole = count > size
+    most = MOST_LOOKS + 8 * count
     mean_j = record[j, 2]
-    margin = HULL_MARGIN * mean_j
+    bend_i = fourth_derivative(record, i, modes)
+    bend_j = fourth_derivative(record, j, modes)
     n_found = 0
     looks = 0
     largest = 0.0
-    g1, d1, _, _, _, _ = gap(record, i, j, dx, dy, compass[0, start], compass[1, start], modes)
+    g1, d1, _, r1, _, _, v1 = gap(record, i, j, dx, dy, compass[0, start], compass[1, start], modes)
     g_first = g1
     d_first = d1
+    r_first = r1
+    v_first = v1
     for index in range(count - 1):
         s = (start + index) % size
         g0 = g1
         d0 = d1
+        r0 = r1
+        v0 = v1
         t = (s + 1) % size
         if whole and index == count - 2:
             g1 = g_first
             d1 = d_first
+            r1 = r_first
+            v1 = v_first
         else:
-            g1, d1, _, _, _, _ = gap(record, i, j, dx, dy, compass[0, t], compass[1, t], modes)
+            g1, d1, _, r1, _, _, v1 = gap(record, i, j, dx, dy, compass[0, t], compass[1, t], modes)
+        # What the depth can differ by from the cubic: spacing^4 / 384 times its fourth derivative.
+        turning = max(v0, v1) / max(min(r0, r1), 1e-9) ** 2
+        margin = spacing**4 / 384.0 * (bend_i + bend_j * turning * turning)
+        margin = max(margin, HULL_MARGIN * mean_j)
         largest = max(largest, abs(g1))
         stack[0, 0] = 0.0
         stack[0, 1] = spacing
@@ -185,11 +209,11 @@ def search_closely(
             fraction = width / spacing
             finer = margin * fraction * fraction * fraction * fraction
             kind = variations(a, b, e, f, width, finer)
-            if kind == 2 and width > 1e-9 and looks < MOST_LOOKS:
+            if kind == 2 and width > 1e-9 and looks < most:
                 looks += 1
                 width *= 0.5
                 ca, sa = turn(compass[0, s], compass[1, s], left + width)
-                gm, dm, _, _, _, _ = gap(record, i, j, dx, dy, ca, sa, modes)
+                gm, dm, _, _, _, _, _ = gap(record, i, j, dx, dy, ca, sa, modes)
                 # The left half lies on top, so that crossings come in order.
                 stack[height, 0] = left + width
                 stack[height, 1] = width

@@ -297,7 +297,7 @@ def exact_velocity(
                             j = second[p]
                             if not own:
                                 j = back_cell[back_first[i] + entry - n_own]
-                            g, _, _, _, _, _ = gap(
+                            g, _, _, _, _, _, _ = gap(
                                 record, i, j, turn * dx, turn * dy, c1, s1, modes
                             )
                             if g <= 0.0:

@@ -31,6 +31,8 @@ from cellquant.sim.lanes import (
 from cellquant.sim.records import HEAD
 
 FINE_MARGIN = 1e-5  # of the interpolation through four samples, single precision included
+WAVE = 5e-3  # amplitude over A0 of what a gap bends by: degree 7 leaves 1.16 bent^2 over it
+ROUGH = 4e-3  # of A0: a gap that bends by more hides what degree 7 cannot see
 STEPS = 3  # of Newton in a gap
 TWO, UNSURE = 2, 3  # crossings in a gap
 SLACK = 0.05  # of a gap: an extremum just beyond its end counts as within
@@ -95,7 +97,7 @@ def judge_gaps(
     for g in range(begin, end, 2 * LANES):
         before, g0, g1, after = gather_pair(depth, place, g, -1)
         e_before, e0, e1, e_after = gather_pair(change, place, g, -1)
-        share = load_pair(weight, g)
+        share = choose(load_pair(weight, g) > 0.0, singles_pair(0.25), singles_pair(0.0))
         difference = g1 - g0
         c2 = 3.0 * difference - 2.0 * e0 - e1
         c3 = e0 + e1 - 2.0 * difference
@@ -126,7 +128,18 @@ def judge_gaps(
         a0 = load_pair(mean, g)
         g1 = load_pair(piece, 8 * room + g)
         flat = HULL_MARGIN * a0
-        margin = choose(load_pair(weight, g) > 0.0, FINE_MARGIN * a0, flat)
+        inner = load_pair(weight, g)
+        # What degree 7 changes, at both ends and in the middle, tells what it leaves.
+        q0 = load_pair(piece, 4 * room + g)
+        q1 = load_pair(piece, 5 * room + g)
+        q2 = load_pair(piece, 6 * room + g)
+        q3 = load_pair(piece, 7 * room + g)
+        bent = absolute(q0 + (q1 + (q2 + q3)))
+        bent = greatest(bent, absolute(q0 + 1.5 * (q1 + 1.5 * (q2 + 1.5 * q3))))
+        bent = greatest(bent, absolute(q0 + 2.0 * (q1 + 2.0 * (q2 + 2.0 * q3))))
+        bent = bent * (1.0 / 16.0)
+        left = FINE_MARGIN * a0 + bent * bent / (WAVE * a0)
+        margin = choose(inner > 0.0, left, flat)
         # Extrema of the cubic, put on the ends where they lie outside. Conditions are signs.
         square = c2 * c2 - 3.0 * c3 * e0
         spread = root(greatest(square, 0.0))
@@ -149,6 +162,7 @@ def judge_gaps(
         close = either(both(near_1, absolute(p1) - margin), both(near_2, absolute(p2) - margin))
         thrice = both(both(change_1, change_2), change_3)
         unsure = either(either(close, greatest(b1, b2) - flat), thrice)
+        unsure = either(unsure, ROUGH * a0 - bent)
         one, none = singles_pair(1.0), singles_pair(0.0)
         number = pick(change_1, one, none) + pick(change_2, one, none) + pick(change_3, one, none)
         if second:

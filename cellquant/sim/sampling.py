@@ -151,7 +151,7 @@ def list_gaps(
     """List the gaps between samples that may hold a crossing; return their number.
 
     Of each gap `place` takes the index of the sample before it, `weight` 0 where there is no
-    sample before or after the gap (else 1/4), and `mean` the A0 of j; for `rows` see `polish`.
+    sample before or after the gap (else 1), and `mean` the A0 of j; for `rows` see `polish`.
     `codes` takes CLOSELY where a pair must be searched in double precision (also where that is
     given), or else OUTSIDE where the first sample lies outside of j and INSIDE where it does not.
     """
@@ -200,7 +200,7 @@ def list_gaps(
         at -= size if at >= size else 0
         j = peek(other, pair)
         poke(place, g, pair * room + LANES + t)
-        poke(weight, g, 0.0 if edge else 0.25)
+        poke(weight, g, 0.0 if edge else 1.0)
         poke(mean, g, peek(pattern, long * j))
         poke(rows, g, 4 * at)
         poke(rows, listed + g, 4 * pair)
