@@ -240,6 +240,24 @@ def test_quadrature_converges_to_the_exact_rule():
     assert errors[2] < 3e-3 * np.sqrt(np.mean(exact**2))
 
 
+@pytest.mark.parametrize(
+    ("modes", "spread", "seeds"),
+    [
+        (6, 0.1, [1]),
+        pytest.param(12, 0.06, range(6), marks=pytest.mark.slow),
+        pytest.param(24, 0.03, range(4), marks=pytest.mark.slow),
+    ],
+)
+def test_no_contact_of_rough_contours_is_missed(modes, spread, seeds):
+    """Lenses between two samples, which the interpolation through them does not show."""
+    scene = Scene(n_cells=36, phi=1.1, modes=modes, **FREE)
+    for seed in seeds:
+        state, radius, box = lively(scene, spread, seed)
+        fine = Layer(scene, radius, box, contact="quadrature", points=20_000)
+        exact = velocity(Layer(scene, radius, box), state)
+        assert np.abs(exact - velocity(fine, state)).max() < 2.5e-3
+
+
 def test_quadrature_of_forty_points_is_the_published_sum():
     """A plain loop over points and neighbours, as the rule is written."""
     scene = Scene(n_cells=9, phi=1.0, **FREE)
