@@ -5,9 +5,10 @@ Runs are kept in a folder and resumed; what is there is measured, however long i
     python benchmarks/published_values.py simulate --folder RUNS --rule exact --cells 256 --seed 1
     python benchmarks/published_values.py measure --folder RUNS
 
-A run starts from a hexagonal lattice. The transient left out is the shortest of 0.1, 0.2, ... 0.6
-of the run after which `Run.stationarity` sees no drift of <p>; where there is none, the second half
-is measured and the row says that it drifts.
+A run starts from a hexagonal lattice, or from the last state of another (`--start RUN.zarr`). The
+transient left out is the shortest of 0.1, 0.2, ... 0.6 of the run after which `Run.stationarity`
+sees no drift of <p>; where there is none, the second half is measured and the row says that it
+drifts.
 """
 
 import argparse
@@ -32,6 +33,7 @@ RULES = {
 }
 LONG = 20_000.0  # t0 that a run may go on for; it is measured whenever one likes
 SAVE_EVERY = 5.0
+FRESH_NOISE = 1000  # added to the seed of runs that start from another's last state
 LEAST = 300.0  # t0 below which a run is not measured
 KEYS = ("p", "drift", "tau_alpha", "sigma2", "xi", "pinched_share", "length", "transient")
 
@@ -43,6 +45,13 @@ def go_on(options):
     )
     point = f"{options.phi}_{options.v0}_{options.eta}"
     name = f"{options.rule}_{options.cells}_{point}_{options.seed}.zarr"
+    if options.start is not None:
+        run = open_run(options.start)
+        state = run.state(-1)
+        scene = scene.replace(
+            radii=run.radius, box=run.box, positions=state[:, :2], polarities=state[:, 2],
+            shapes=state[:, 3:], seed=FRESH_NOISE + options.seed,
+        )  # fmt: skip
     simulate(
         scene, duration=LONG, save_every=SAVE_EVERY, output=options.folder / name,
         **RULES[options.rule],
@@ -81,6 +90,7 @@ def measure(path):
         "v0": scene.v0,
         "eta": scene.eta,
         "seed": scene.seed,
+        "started_from": "lattice" if scene.shapes is None else "state",
         "length": float(run.time[-1]),
         "transient": float(run.time[start]),
         "stationary": test.stationary,
@@ -107,14 +117,13 @@ def pinched_share(run):
 def tabulate(rows):
     """Means over the seeds and their standard errors, beside the published values."""
     table = []
-    for key in sorted({(r["rule"], r["cells"], r["phi"], r["v0"], r["eta"]) for r in rows}):
-        rule, cells, phi, v0, eta = key
-        chosen = [r for r in rows if (r["rule"], r["cells"], r["phi"], r["v0"], r["eta"]) == key]
-        entry = {
-            "rule": rule, "cells": cells, "phi": phi, "v0": v0, "eta": eta,
-            "n_seeds": len(chosen), "n_stationary": sum(r["stationary"] for r in chosen),
-            "published": PUBLISHED.get((phi, v0, eta), {}),
-        }  # fmt: skip
+    names = ("rule", "cells", "phi", "v0", "eta", "started_from")
+    for key in sorted({tuple(r[name] for name in names) for r in rows}):
+        chosen = [r for r in rows if tuple(r[name] for name in names) == key]
+        entry = dict(zip(names, key, strict=True))
+        entry["n_seeds"] = len(chosen)
+        entry["n_stationary"] = sum(r["stationary"] for r in chosen)
+        entry["published"] = PUBLISHED.get(key[2:5], {})
         for name in KEYS:
             values = np.array([r[name] for r in chosen if r[name] is not None], float)
             if len(values):
@@ -135,6 +144,7 @@ def main():
     parser.add_argument("--v0", type=float, default=0.03)
     parser.add_argument("--eta", type=float, default=0.01)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--start", type=Path, help="run whose last state is the first one")
     options = parser.parse_args()
     if options.task == "simulate":
         go_on(options)

@@ -205,7 +205,8 @@ def main():
     if published:
         parts.append("## Published values\n")
         parts.append(
-            "Runs from a hexagonal lattice; `length` is the whole run, the transient left out is "
+            "Runs from a hexagonal lattice, or from the last state of the exact run of the same "
+            "seed (start: state); `length` is the whole run, the transient left out is "
             "the shortest tenth part of it after which <p> shows no drift (`Run.stationarity`; "
             "'steady' counts the seeds for which there is one, else the second half is measured). "
             "Errors are standard errors over seeds. sigma^2 is the mean square displacement of "
@@ -214,7 +215,7 @@ def main():
             "publication has N = 1024 and windows up to 2e5 t0.\n"
         )
         rows = [
-            [r["rule"], str(r["cells"]), f"{r['phi']}, {r['v0']}, {r['eta']}"]
+            [r["rule"], r["started_from"], str(r["cells"]), f"{r['phi']}, {r['v0']}, {r['eta']}"]
             + [f"{r['n_stationary']} of {r['n_seeds']}"]
             + [number(r.get("length"), 4), number(r.get("transient"), 3)]
             + [
@@ -229,7 +230,7 @@ def main():
             for r in published["table"]
         ]  # fmt: skip
         header = [
-            "rule", "N", "phi, v0, eta", "steady", "length / t0", "transient", "<p>", "drift",
+            "rule", "start", "N", "phi, v0, eta", "steady", "length / t0", "transient", "<p>", "drift",
             "tau_alpha", "sigma^2", "xi", "pinched", "published",
         ]  # fmt: skip
         parts.append(table(header, rows))

@@ -132,6 +132,7 @@ class SceneConfig(_Strict):
     initial: Literal["hexagonal", "random"] = "hexagonal"
     positions: list[tuple[Finite, Finite]] | None = None
     polarities: list[Finite] | None = None
+    shapes: list[list[Finite]] | None = None
     seed: Annotated[int, Field(ge=0)] = 1
     transient: NotNegative = 500.0
     duration: Positive = 1000.0
@@ -146,7 +147,7 @@ class SceneConfig(_Strict):
     @classmethod
     def _lists_count_the_cells(cls, content: Any) -> Any:
         if isinstance(content, dict) and "cells" not in content:
-            for name in ("radii", "positions", "polarities"):
+            for name in ("radii", "positions", "polarities", "shapes"):
                 if isinstance(content.get(name), list):
                     return {**content, "cells": len(content[name])}
         return content
@@ -327,6 +328,7 @@ modes = 6                 # highest Fourier mode of a contour; 1 for rigid discs
 # radii = [0.5, 0.55]     # one per cell in L0, instead of polydispersity
 # initial = "random"      # then relaxed; without it a hexagonal lattice
 # positions = [[1.0, 1.0], [2.1, 1.0]]   # centres in L0, and polarities = [...] in radians
+# shapes = [[0.1, ...], ...]   # per cell a_2 .. a_M, b_2 .. b_M; circles where left out
 transient = 500           # t0, not saved
 duration = 1000           # t0, saved after the transient
 seed = 1

@@ -422,9 +422,25 @@ def test_scene_files_give_box_radii_and_initial_state():
         ({"positions": [[0, 0], [1, 1]], "initial": "random"}, "positions and initial"),
         ({"box": [1.0, 1.0], "cells": 9}, "7.07 times its area"),
         ({"radii": [0.5, -0.5]}, "radii"),
+        ({"shapes": [[0.1, 0.2]], "modes": 3}, "shapes must be rows of 4 finite numbers"),
+        ({"shapes": [[0.1] * 10, [1e9] * 10]}, "shapes must be rows of 10 finite numbers"),
+        ({"shapes": [[0.1] * 10], "cells": 2}, "shapes must have one entry per cell"),
     ):
         with pytest.raises(InputError, match=match):
             scene(**wrong)
+
+
+def test_a_run_goes_on_from_the_state_of_another():
+    first = simulate(SMALL, duration=4)
+    state = first.state(-1)
+    scene = SMALL.replace(
+        radii=first.radius, box=first.box, positions=state[:, :2], polarities=state[:, 2],
+        shapes=state[:, 3:], seed=2, v0=0.01,
+    )  # fmt: skip
+    later = simulate(scene, duration=2, integrator="euler", contact="quadrature")
+    assert np.array_equal(later.state(0), state)
+    assert not np.array_equal(later.state(-1), state)
+    assert Scene.from_dict(scene.to_dict()) == scene
 
 
 def test_a_growing_run_is_read_as_a_whole(tmp_path, monkeypatch):

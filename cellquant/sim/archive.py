@@ -18,7 +18,7 @@ from cellquant import __version__
 from cellquant.errors import InputError
 from cellquant.io.runstore import check_run_store, read_arrays
 from cellquant.sim.rows import RunRows, RunScan
-from cellquant.sim.scene import Scene
+from cellquant.sim.scene import MOST_OF_A_MODE, Scene
 from cellquant.sim.shapes import shape_indices
 from cellquant.storage import atomic_path
 from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
@@ -26,7 +26,6 @@ from cellquant.tables import REDUCED, TRACK_COLUMNS, Tracks
 Floats = NDArray[np.float64]
 CHECKPOINT = "checkpoint.npz"
 _LARGEST = 1e300  # number in the description of a run
-MOST_OF_A_MODE = 100.0  # a_n or b_n; lobes of the area pi R0^2 are some ten R0 long at most
 CHUNK = 262_144  # numbers of a chunk: what one write of a growing run touches
 
 

@@ -54,6 +54,8 @@ def initial_state(scene: Scene) -> tuple[Floats, Floats, Floats]:
     rng = np.random.default_rng([scene.seed, 2])
     angles = rng.uniform(0.0, 2.0 * math.pi, scene.n_cells)
     state[:, 2] = angles if scene.polarities is None else scene.polarities
+    if scene.shapes is not None:
+        state[:, 3:] = scene.shapes
     if scene.positions is not None:
         state[:, :2] = scene.positions
     elif scene.initial == "random":

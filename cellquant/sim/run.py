@@ -92,8 +92,8 @@ def simulate(
     InputError
         If an option is wrong, or `output` holds something else.
     SimulationFailure
-        If the run cannot go on: a step too long even in 64 parts, a contour that is none. The
-        exception carries the partial run, the step, the cell and the remedy.
+        If the run cannot go on, e.g. a step is too long even in 64 parts. The exception carries
+        the partial run, the step, the cell and the remedy.
     """
     if seed is not None:
         scene = scene.replace(seed=seed)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from cellquant.config import SceneConfig
 
 MAX_MODES = 24
+MOST_OF_A_MODE = 100.0  # a_n or b_n; lobes of the area pi R0^2 are some ten R0 long at most
 INITIAL_STATES = ("hexagonal", "random")
 
 
@@ -90,6 +91,10 @@ class Scene:
         ``"hexagonal"``, or ``"random"`` (uniform, then relaxed as passive cells).
     positions, polarities
         (n_cells, 2) and (n_cells,) initial centres and polarities instead of `initial`.
+    shapes
+        (n_cells, 2(M-1)) initial a_2 .. a_M, b_2 .. b_M instead of circles. With the columns of
+        `Run.state` as positions, polarities and shapes, and its radii and box, a run goes on
+        under other parameters.
     seed
         Seed of radii, initial polarities and noise.
 
@@ -118,6 +123,7 @@ class Scene:
     initial: str = "hexagonal"
     positions: tuple[tuple[float, float], ...] | None = field(default=None, repr=False)
     polarities: tuple[float, ...] | None = field(default=None, repr=False)
+    shapes: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -163,6 +169,15 @@ class Scene:
             _length("polarities", self.polarities, self.n_cells)
             for angle in self.polarities:
                 _number("polarities", angle, -math.inf, math.inf)
+        if self.shapes is not None:
+            _length("shapes", self.shapes, self.n_cells)
+            columns = 2 * (self.modes - 1)
+            for shape in self.shapes:
+                if len(shape) != columns or not all(abs(x) <= MOST_OF_A_MODE for x in shape):
+                    raise InputError(
+                        f"shapes must be rows of {columns} finite numbers, a_2 .. a_M, b_2 .. b_M "
+                        f"for modes = {self.modes}, got {shape}; correct it."
+                    )
         fraction = self._known_fraction()
         if fraction is not None and fraction > 2.0:
             raise InputError(
@@ -176,9 +191,10 @@ class Scene:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, tuple(float(x) for x in value))
-        if self.positions is not None:
-            rows = tuple(tuple(float(x) for x in row) for row in self.positions)
-            object.__setattr__(self, "positions", rows)
+        for name in ("positions", "shapes"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, tuple(tuple(float(x) for x in r) for r in value))
 
     def _known_fraction(self) -> float | None:
         if self.box is None:
@@ -243,6 +259,7 @@ class Scene:
             initial=config.initial,
             positions=None if config.positions is None else tuple(config.positions),
             polarities=None if config.polarities is None else tuple(config.polarities),
+            shapes=None if config.shapes is None else tuple(tuple(s) for s in config.shapes),
             seed=config.seed,
         )
 
