@@ -230,8 +230,8 @@ def main():
             for r in published["table"]
         ]  # fmt: skip
         header = [
-            "rule", "start", "N", "phi, v0, eta", "steady", "length / t0", "transient", "<p>", "drift",
-            "tau_alpha", "sigma^2", "xi", "pinched", "published",
+            "rule", "start", "N", "phi, v0, eta", "steady", "length / t0", "transient", "<p>",
+            "drift", "tau_alpha", "sigma^2", "xi", "pinched", "published",
         ]  # fmt: skip
         parts.append(table(header, rows))
         parts.append(NOTES)
