@@ -6,14 +6,16 @@ import numpy as np
 
 from cellquant.track.fates import Fates
 from cellquant.track.kernels import link_steps, neighbour_mean, pair_gains, steps_ahead
-from cellquant.track.movie import NEAR, FloatArray, IntArray, Links, Movie
+from cellquant.track.movie import LOG_AREA, NEAR, BoolArray, FloatArray, IntArray, Links, Movie
 from cellquant.track.shapes import TAIL, Shapes
 
 KINDS = 4  # no path, path after, path before, path on both sides
 TERMS = 7
 _TAILS = (4.0, 6.0, 8.0, 12.0)  # heavier ones would make room for wrong links
-_PRIOR_FRAME, _PRIOR_STIRRED = 20.0, 50.0  # links that say that frames and places are alike
+_PRIOR_SPREAD = (20.0, 50.0, 50.0)  # links that say that frames, stirred and edge cells are alike
 _SPREAD = (0.2, 5.0)
+_SLIVER = 2  # grade of cells of which the edge of the view leaves less than half
+_CAREFUL = 5.0  # of log likelihood that speaks against a heavier tail of slivers
 _PRIOR_LINKS = 10.0
 _FIT_LINKS = 10000  # links that a fit looks at, evenly taken
 _PRIOR_FLOW = 0.5  # neighbours that the first guess of the flow counts for
@@ -52,14 +54,17 @@ class Motion:
     ``coefficients`` (4, 7) of: neighbours now near, neighbours now wide, neighbours before,
     neighbours of the partner now, neighbours of the partner next, own step before, partner's
     step next. ``scale`` (4,) and ``tail`` (4,) of the two-dimensional Student density.
-    ``spread`` (N,) says how many times wider it is at each cell: in its frame, and where cells
-    die or divide beside it.
+    ``spread`` (N,) says how many times wider it is at each cell: in its frame, where cells die or
+    divide beside it, and where the edge of the view cuts it. ``slivers`` (N,), of which that edge
+    leaves less than half a cell, have a ``sliver_tail`` of their own.
     """
 
     coefficients: FloatArray
     scale: FloatArray
     tail: FloatArray
     spread: FloatArray
+    slivers: BoolArray
+    sliver_tail: float
 
 
 def paths(movie: Movie, links: Links | None, flow: FloatArray, carried: FloatArray) -> Paths:
@@ -176,7 +181,8 @@ def first_motion(movie: Movie, flow: FloatArray, candidates: IntArray) -> Motion
     likely = np.array(likelihood) >= max(likelihood) - _CAUTION
     first = max(float(_FIRST_SCALES[likely][-1]), _PRIOR_SCALE) * spacing
     scale, tail = np.full(KINDS, first), np.full(KINDS, 4.0)
-    return Motion(coefficients, scale, tail, np.ones(movie.n_cells))
+    nobody = np.zeros(movie.n_cells, dtype=np.bool_)
+    return Motion(coefficients, scale, tail, np.ones(movie.n_cells), nobody, _TAILS[-1])
 
 
 def fit_motion(
@@ -231,9 +237,32 @@ def fit_motion(
     kinds: IntArray = 2 * paths.has_before[source] + paths.has_after[target]
     rest = y - np.einsum("ltd,lt->ld", x, coefficients[kinds])
     square = np.sum(rest**2, axis=1) * before.spread[source] ** 2 / scale[kinds] ** 2
-    stirred = _stirred(movie, links)
-    spread = _spread(square, weight, tail[kinds], frames, stirred[source], len(movie.time))
-    return Motion(coefficients, scale, tail, spread[movie.frame_index, stirred])
+    at_edge = _at_edge(movie, candidates)
+    slivers = at_edge == _SLIVER
+    tails = np.where(slivers[source], before.sliver_tail, tail[kinds])
+    groups = (movie.frame_index, _stirred(movie, links), at_edge)
+    spread = _spread(square, weight, tails, groups, source)
+    cut = slivers[source]
+    sliver_tail = _tail(square[cut] / spread[source[cut]] ** 2, weight[cut], _CAREFUL)
+    return Motion(coefficients, scale, tail, spread, slivers, sliver_tail)
+
+
+def _tail(square: FloatArray, weight: FloatArray, margin: float) -> float:
+    """Lightest tail of the Student density that no other beats by more than `margin`, from
+    residuals over the scale, squared (L,)."""
+    likelihood = [-(v / 2 + 1) * float(weight @ np.log1p(square / v)) for v in _TAILS]
+    best = max(likelihood) - margin
+    return max(v for v, value in zip(_TAILS, likelihood, strict=True) if value >= best)
+
+
+def _at_edge(movie: Movie, candidates: IntArray) -> IntArray:
+    """1 for the cells (N,) that the edge of the view cuts now or next, 2 for slivers, of which it
+    leaves less than half a usual cell: centroids wander as more or less of a cell is seen."""
+    area = movie.shape[:, LOG_AREA]
+    grade = np.where(movie.cut, np.where(area < np.median(area) - np.log(2.0), _SLIVER, 1), 0)
+    following = np.where(candidates[:, 0] >= 0, grade[candidates[:, 0]], 0)
+    found: IntArray = np.maximum(grade, following)
+    return found
 
 
 def _stirred(movie: Movie, links: Links) -> IntArray:
@@ -249,27 +278,29 @@ def _spread(
     square: FloatArray,
     weight: FloatArray,
     tail: FloatArray,
-    frame: IntArray,
-    stirred: IntArray,
-    n_frames: int,
+    groups: tuple[IntArray, ...],
+    source: IntArray,
 ) -> FloatArray:
-    """Factors (P, 2) on the scale for each frame, calm and stirred.
+    """Factors (N,) on the scale: the product of one of each cell's frame, of its being stirred,
+    and of its lying at the edge.
 
-    square (L,) are residuals over the scale, squared. Both kinds of factor come from robust
-    scatter, each drawn towards 1.
+    square (L,) are residuals over the scale, squared, of links that leave `source` (L,). All
+    factors come from robust scatter, each drawn towards 1.
     """
-    by_frame, by_stir = np.ones(n_frames), np.ones(2)
+    factors = [np.ones(int(group.max()) + 1) for group in groups]
+    of_links = [group[source] for group in groups]
     for _ in range(8):
-        for factor, group, prior in (
-            (by_stir, stirred, _PRIOR_STIRRED),
-            (by_frame, frame, _PRIOR_FRAME),
-        ):
-            width = (by_frame[frame] * by_stir[stirred]) ** 2
-            robust = weight * (tail + 2.0) / (tail + square / width) * square / width / 2
+        for factor, group, prior in zip(factors, of_links, _PRIOR_SPREAD, strict=True):
+            product = np.ones(len(square))
+            for other, place in zip(factors, of_links, strict=True):
+                product *= other[place] ** 2
+            robust = weight * (tail + 2.0) / (tail + square / product) * square / product / 2
             top = factor**2 * np.bincount(group, robust, len(factor)) + prior
             factor[:] = np.sqrt(top / (np.bincount(group, weight, len(factor)) + prior))
-    spread: FloatArray = np.clip(by_frame[:, None] * by_stir, *_SPREAD)
-    return spread
+    spread = np.ones(len(groups[0]))
+    for factor, group in zip(factors, groups, strict=True):
+        spread *= factor[group]
+    return np.clip(spread, *_SPREAD)
 
 
 def _student_fit(
@@ -296,8 +327,7 @@ def _student_fit(
         scale = float(np.sqrt((robust @ square / 2 + _PRIOR_LINKS * prior_scale) / total))
         scale = max(scale, 1e-3 * spacing)
         far = square / scale**2
-        likelihood = [-(v / 2 + 1) * float(weight @ np.log(1.0 + far / v)) for v in _TAILS]
-        nu = _TAILS[int(np.argmax(likelihood))]
+        nu = _tail(far, weight, 0.0)
         if nu == before[1] and abs(scale - before[0]) < _FIT_ENOUGH * scale:
             break
     return coefficient, scale, nu
@@ -333,6 +363,8 @@ def gains(
         motion.coefficients,
         motion.scale,
         motion.tail,
+        motion.slivers,
+        motion.sliver_tail,
         shape,
         expected,
         shapes.spread,

@@ -20,12 +20,14 @@ def soft_flow(
     widths: FloatArray,
     rounds: IntArray,
     outlier: float,
+    voice: FloatArray,
 ) -> float:
     """Move `flow` (n, 2) onto the next frame by soft assignment with shrinking width.
 
     Each cell spreads its weight over the candidates as ``exp(-d^2 / 2 width^2)``, divided by what
-    competes for the same cell in either frame; its mean displacement is then averaged over its
-    neighbours. Returns the mean weight that found a partner.
+    competes for the same cell in either frame; its mean displacement, which counts as much as its
+    `voice` (n,), is then averaged over its neighbours. Returns the mean weight that found a
+    partner.
     """
     n, k = candidates.shape
     weight = np.zeros((n, k))
@@ -59,7 +61,8 @@ def soft_flow(
                 mass += w
                 mx += w * (there[j, 0] - here[i, 0])
                 my += w * (there[j, 1] - here[i, 1])
-            moved[i, 0], moved[i, 1], moved[i, 2] = mx, my, mass
+            for d, value in enumerate((mx, my, mass)):
+                moved[i, d] = voice[i] * value
             matched += mass
         for _ in range(rounds[step]):
             for i in range(n):
@@ -324,6 +327,8 @@ def pair_gains(
     coefficients: FloatArray,
     scale: FloatArray,
     tail: FloatArray,
+    slivers: BoolArray,
+    sliver_tail: float,
     shape_after: FloatArray,
     shape_expected: FloatArray,
     shape_spread: FloatArray,
@@ -340,19 +345,18 @@ def pair_gains(
     """Log odds of every candidate link against death of one cell and birth of the other.
 
     gain (N, K); candidates (N, K) with -1 where there is none. The residual of the displacement
-    from its prediction has a two-dimensional Student density; so has the change of shape, against
-    the density of shapes in the population, unless the edge of the view cuts one of them.
-    shape_after and shape_expected (N, F) are each cell's descriptors, and those expected of its
-    successor, in units of their scatter; unlike (N,) is the negative log density of each shape in
-    the population, up to the constants of both densities. Shapes are compared where the best of
-    them could bring a candidate within `doubt` of the likeliest of its cell.
+    from its prediction has a two-dimensional Student density, of slivers (N,) with a tail of their
+    own; so has the change of shape, against the density of shapes in the population, unless the
+    edge of the view cuts one of them. shape_after and shape_expected (N, F) are each cell's
+    descriptors, and those expected of its successor, in units of their scatter; unlike (N,) is the
+    negative log density of each shape in the population, up to the constants of both densities.
+    Shapes are compared where the best of them could bring a candidate within `doubt` of the
+    likeliest of its cell.
     """
     n, k = candidates.shape
     f = shape_after.shape[1]
     half = (shape_tail + f) / 2
-    kinds = len(scale)
     height = -np.log(2 * np.pi * scale**2)
-    power = tail / 2 + 1
     # What partners bring to the prediction, for cells without and with a step before.
     partner = np.empty((n, 2, 2))
     for j in range(n):
@@ -363,7 +367,8 @@ def pair_gains(
                 if has_after[j]:
                     value += b[6] * own_after[j, d]
                 partner[j, before, d] = value
-    ahead, inverse, step = np.empty((2, 2)), np.empty(kinds), np.empty(k)
+    ahead, inverse, step = np.empty((2, 2)), np.empty(2), np.empty(k)
+    power = np.empty(2)
     for i in range(n):
         before = has_before[i]
         for after in range(2):
@@ -375,7 +380,9 @@ def pair_gains(
                     value += b[5] * own_before[i, d]
                 ahead[after, d] = value
             width = scale[2 * before + after] * spread[i]
-            inverse[after] = elapsed[i] ** 2 / (width * width * tail[2 * before + after])
+            nu = sliver_tail if slivers[i] else tail[2 * before + after]
+            inverse[after] = elapsed[i] ** 2 / (width * width * nu)
+            power[after] = nu / 2 + 1
         wide = f * np.log(shape_spread[i])
         fate = stay[i] - leave[i] - 2.0 * np.log(spread[i])
         best, most = -1, -np.inf
@@ -393,7 +400,7 @@ def pair_gains(
             rx = dx / elapsed[i] - ahead[after, 0] - partner[j, before, 0]
             ry = dy / elapsed[i] - ahead[after, 1] - partner[j, before, 1]
             step[c] = height[kind] + fate - appear[j]
-            step[c] -= power[kind] * np.log(1.0 + (rx * rx + ry * ry) * inverse[after])
+            step[c] -= power[after] * np.log(1.0 + (rx * rx + ry * ry) * inverse[after])
             if step[c] > most:
                 best, most = c, step[c]
         # The likeliest by its step first: it says which of the others are in doubt.

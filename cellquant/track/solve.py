@@ -29,7 +29,8 @@ from cellquant.track.shapes import Shapes, fit_shapes, population_of
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
 
-PASSES = 5
+PASSES, MOST_PASSES = 5, 10
+_STILL, _NEARLY_STILL = 0.003, 0.03  # share of links that a pass changes: end of passes, averaging
 _UNLIKELY = 1e-4  # links below this probability are not offered to the assignment
 _MARGIN = 3.0  # of log odds below that, where links no longer matter to their rivals
 _SWEEPS = 6  # of belief propagation
@@ -109,15 +110,17 @@ def solve(
     """
     state = _start(movie, options)
     wide = state.motion.scale[0] > _WIDE * float(np.median(movie.spacing))
-    early = _EARLY if wide else 0
-    frames, total = len(movie.time), PASSES + early + 1
+    turn = first = -_EARLY if wide else 0
+    frames, total = len(movie.time), MOST_PASSES - first + 1
     images = None
+    changed = 1.0
     if progress is not None:
         progress(frames // total, frames)
-    for turn in range(-early, PASSES):
+    while turn < PASSES or (turn < MOST_PASSES and changed > _STILL):
         if state.links is not None:
             _refit(state, options, turn)
         state.fates = fates(movie, state.links, state.rates, state.leaving, state.entering)
+        before, links = state.gain, state.links
         state.gain = gains(
             movie,
             state.candidates,
@@ -130,12 +133,20 @@ def solve(
         if masks is not None and options.use_images and turn >= _IMAGE_PASS:
             if images is None:
                 images = PairImages(movie, masks, raw, pixel_size)
-            # Looked at twice: the last pass expects the cells more exactly.
+            # Looked at twice: a later pass expects the cells more exactly.
             if state.looks is None or turn == PASSES - 1:
                 ahead = expected_steps(movie, state.known, state.motion, own_path=True)
                 images.expect(movie.position + ahead)
                 state.looked, state.looks = _compare(state, images)
             _add_images(state)
+        if turn > _IMAGE_PASS and changed < _NEARLY_STILL:
+            # Links in doubt pull the model to and fro; the mean of the passes is better than any.
+            assert before is not None
+            state.gain = np.where(
+                np.isfinite(before) & np.isfinite(state.gain),
+                (before + state.gain) / 2,
+                state.gain,
+            )
         middle = movie.position + expected_steps(movie, state.known, state.motion, own_path=False)
         if options.divisions and turn >= _DIVISION_PASS:
             state.divisions = fit_divisions(
@@ -148,8 +159,13 @@ def solve(
                 tail=float(state.motion.tail[0]),
             )
         state.links = _assign(state, middle, images)
+        if links is not None:
+            changed = float(np.mean(links.after != state.links.after))
+        turn += 1
         if progress is not None:
-            progress(frames * (turn + early + 2) // total, frames)
+            progress(frames * (turn - first + 1) // total, frames)
+    if progress is not None:
+        progress(frames, frames)
     return state
 
 
