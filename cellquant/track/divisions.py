@@ -1,4 +1,4 @@
-"""Divisions: one mother, two daughters, judged by place, distance and sizes."""
+"""Divisions: one mother, two daughters, judged by place, distance and sizes; and broken masks."""
 
 from dataclasses import dataclass
 
@@ -14,27 +14,55 @@ _STRETCH_FLOOR = 0.1
 _LEAST = 6.0
 _SIZE_BLUR = 0.1  # of the logarithm of the area
 _RARE = 1e-4
+_PATCH_FRAMES = 3  # for which a mask may be broken
+_PATCHED = 0.25  # of the logarithm of the area, by which a mask that was mended may differ
+_ENOUGH_BROKEN = 10
 
 
 @dataclass(frozen=True)
 class Divisions:
-    """Log-normal daughters: mean and deviation of each quantity.
+    """Log-normal daughters: mean and deviation of each quantity, for M kinds of family.
 
-    ``separation`` of the logarithm of the daughters' distance over the root of their summed area;
-    ``total`` of the logarithm of their summed area over the mother's; ``uneven`` deviation of the
-    logarithm of their ratio; ``informative`` chance that these sizes say more than those of any
-    two cells; ``stretch`` (3, 3) elongation of mother, daughters and any cell along the daughters'
-    line, its width, and the width across; ``population`` (N,) log frequency of each
-    cell's size among all cells; ``width`` of the place of their middle.
+    The first kind are divisions; the second, where there are enough of them, masks that are broken
+    in two for a few frames. ``separation`` (M, 2) of the logarithm of the daughters' distance over
+    the root of their summed area; ``ratios`` (M, 4) mean and deviation of the logarithm of their
+    summed area over the mother's, deviation of the logarithm of their ratio, and the chance that
+    these sizes say more than those of any two cells; ``stretch`` (M, 3, 3) elongation of mother,
+    daughters and any cell along the daughters' line, its width, and the width across; ``width``
+    (M,) of the place of their middle; ``population`` (N,) log frequency of each cell's size among
+    all cells; ``log_broken`` chance of a mask to break.
     """
 
-    separation: tuple[float, float]
-    total: tuple[float, float]
-    uneven: float
-    informative: float
+    separation: FloatArray
+    ratios: FloatArray
     stretch: FloatArray
+    width: FloatArray
     population: FloatArray
-    width: float
+    log_broken: float
+
+
+def broken_masks(movie: Movie, links: Links) -> tuple[IntArray, IntArray]:
+    """Mothers whose two daughters are soon one cell again, of the size of both, and the daughter
+    that is left.
+
+    One daughter ends within three frames, and the next cell of the other is as large as both.
+    """
+    mothers = np.flatnonzero(links.second >= 0)
+    size = np.exp(movie.shape[:, LOG_AREA])
+    one, two = links.after[mothers], links.second[mothers]
+    left = np.full(len(mothers), -1, dtype=np.int64)
+    a, b = one.copy(), two.copy()
+    for _ in range(_PATCH_FRAMES):
+        for stays, first, ends in ((a, one, b), (b, two, a)):
+            following = links.after[stays]
+            whole = (following >= 0) & (links.after[ends] < 0) & (left < 0)
+            whole &= (stays >= 0) & (ends >= 0) & (links.second[stays] < 0)
+            ratio = np.log(size[following] / (size[stays] + size[ends]))
+            left[whole & (np.abs(ratio) < _PATCHED)] = first[whole & (np.abs(ratio) < _PATCHED)]
+        a = np.where((a >= 0) & (links.second[a] < 0), links.after[a], -1)
+        b = np.where((b >= 0) & (links.second[b] < 0), links.after[b], -1)
+    found = left >= 0
+    return mothers[found], left[found]
 
 
 def fit_divisions(
@@ -47,25 +75,59 @@ def fit_divisions(
     width: float,
     tail: float,
 ) -> Divisions:
-    """Estimate the daughters' geometry from the divisions found, with a weak general prior.
+    """Estimate the daughters' geometry from the families found, with a weak general prior.
 
     `population` (N,) is the `log_frequency` of the cells' sizes. `width`, `tail` and `spread` (N,)
     are those of single cells' steps around `middle` (N, 2), where they are expected.
     """
-    area = movie.shape[:, LOG_AREA]
-    centre = float(np.median(area))
-    spacing = float(np.median(movie.spacing))
-    mothers = np.empty(0, dtype=np.int64)
+    nobody = np.empty(0, dtype=np.int64)
+    mothers, broken = nobody, nobody
     if links is not None:
         mothers = np.flatnonzero(links.second >= 0)
-    one, two = (
-        (links.after[mothers], links.second[mothers]) if links is not None else (mothers, mothers)
+        broken, _ = broken_masks(movie, links)
+    if len(broken) < _ENOUGH_BROKEN:
+        broken = nobody
+    kinds = [np.setdiff1d(mothers, broken)]
+    if len(broken):
+        kinds.append(broken)
+    centre = float(np.median(movie.shape[:, LOG_AREA]))
+    apart = float(np.log(0.85 * np.median(movie.spacing)) - centre / 2 - 0.15)
+    separation, ratios, stretch, widths = [], [], [], []
+    for mothers in kinds:
+        one, two = mothers, mothers
+        if links is not None:
+            one, two = links.after[mothers], links.second[mothers]
+        found = _fit_kind(movie, mothers, one, two, apart, population)
+        separation.append(found[0])
+        ratios.append(found[1])
+        stretch.append(_fit_stretch(movie, mothers, one, two))
+        place = (movie.position[one] + movie.position[two]) / 2 - middle[mothers]
+        square = np.sum(place**2, axis=1) / spread[mothers] ** 2
+        widths.append(_robust_width(square, 1.5 * width, tail))
+    return Divisions(
+        separation=np.array(separation),
+        ratios=np.array(ratios),
+        stretch=np.array(stretch),
+        width=np.array(widths),
+        population=population,
+        log_broken=float(np.log((len(broken) + 0.5) / (movie.n_cells + 1.0))),
     )
+
+
+def _fit_kind(
+    movie: Movie,
+    mothers: IntArray,
+    one: IntArray,
+    two: IntArray,
+    usual: float,
+    population: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Separation (2,) and ratios (4,) of one kind of family; `usual` is their prior distance."""
+    area = movie.shape[:, LOG_AREA]
     both = np.logaddexp(area[one], area[two])
     apart = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T)) - both / 2
     total = both - area[mothers]
     ratio = area[one] - area[two]
-    place = (movie.position[one] + movie.position[two]) / 2 - middle[mothers]
     total_fit = _normal(total, 0.3, 0.35, 0.1)
     uneven = _normal(ratio, 0.0, 0.3, 0.1, fixed=True)[1]
     # How often the sizes of daughters are told better by these laws than by the population.
@@ -76,15 +138,8 @@ def fit_divisions(
     for _ in range(20):
         share = informative * ratio_of / (informative * ratio_of + 1.0 - informative)
         informative = (float(share.sum()) + 1.0) / (len(mothers) + 2.0)
-    return Divisions(
-        separation=_normal(apart, np.log(0.85 * spacing) - centre / 2 - 0.15, 0.3, 0.1),
-        total=total_fit,
-        uneven=uneven,
-        informative=informative,
-        stretch=_fit_stretch(movie, mothers, one, two),
-        population=population,
-        width=_robust_width(np.sum(place**2, axis=1) / spread[mothers] ** 2, 1.5 * width, tail),
-    )
+    separation = _normal(apart, usual, 0.3, 0.1)
+    return np.array(separation), np.array([*total_fit, uneven, informative])
 
 
 def _robust_width(square: FloatArray, prior: float, tail: float) -> float:
@@ -168,6 +223,10 @@ def propose(
     least = -_LEAST  # an image cue can still speak for it
     cells = np.empty((_PER_MOTHER * movie.n_cells, 3), dtype=np.int64)
     gain = np.empty(len(cells))
+    kinds = len(model.width)
+    prior = np.empty((kinds, movie.n_cells))
+    prior[0] = log_rate
+    prior[1:] = model.log_broken
     found = division_gains(
         movie.position,
         movie.shape,
@@ -175,13 +234,13 @@ def propose(
         candidates,
         orphan,
         middle,
-        model.width * spread,
+        model.width[:, None] * spread,
         tail,
-        np.array(model.separation),
-        np.array([*model.total, model.uneven, model.informative]),
+        model.separation,
+        model.ratios,
         model.population,
         model.stretch,
-        log_rate,
+        prior,
         leave,
         appear,
         least,

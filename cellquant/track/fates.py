@@ -64,8 +64,12 @@ def places(movie: Movie, flow: FloatArray) -> tuple[IntArray, IntArray]:
     return np.where(at_edge(ahead), EDGE, inside), np.where(at_edge(back), EDGE, inside)
 
 
-def fit_rates(movie: Movie, links: Links | None, leaving: IntArray, entering: IntArray) -> Rates:
+def fit_rates(
+    movie: Movie, links: Links | None, broken: IntArray, leaving: IntArray, entering: IntArray
+) -> Rates:
     """Chances to vanish, appear and divide from counts, each with a weak prior.
+
+    `broken` are mothers whose masks only fell apart for a while, which is no division.
 
     Frames differ: the interval may be uneven, or many cells die at once. Every frame is drawn
     towards the mean over the movie, the more the better that mean explains all frames.
@@ -84,10 +88,12 @@ def fit_rates(movie: Movie, links: Links | None, leaving: IntArray, entering: In
     cell = np.arange(movie.n_cells)
     may_leave, may_enter = cell < movie.start[-2], cell >= movie.start[1]
     gone, new = links.after < 0, links.before < 0
+    divided = links.second >= 0
+    divided[broken] = False
     vanish = [rate(gone, may_leave & (leaving == place)) for place in range(PLACES)]
     appear = [rate(new, may_enter & (entering == place)) for place in range(PLACES)]
     return Rates(
-        np.column_stack(vanish), np.column_stack(appear), rate(links.second >= 0, may_leave)
+        np.column_stack(vanish), np.column_stack(appear), rate(divided, may_leave)
     )
 
 

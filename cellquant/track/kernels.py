@@ -457,8 +457,9 @@ def division_gains(
     against their size is log-normal, and so are the sum of their areas against the mother's and
     their ratio, unless (with chance 1 - ratios[3]) their sizes tell nothing. Mother and daughters
     are elongated along their line by `stretch` (mother, daughters, any cell: mean, width along,
-    width across; Student density). population (N,) is the log density of sizes at each cell.
-    Writes (mother, daughter, daughter), at most `most` per mother, best first.
+    width across; Student density). Each kind of family has such laws of its own, first axis of
+    width, separation, ratios, stretch and prior. population (N,) is the log density of sizes at
+    each cell. Writes (mother, daughter, daughter), at most `most` per mother, best first.
     """
     k = candidates.shape[1]
     nu = 5.0
@@ -480,31 +481,35 @@ def division_gains(
                     continue
                 mx = (position[h, 0] + position[j, 0]) / 2 - middle[i, 0]
                 my = (position[h, 1] + position[j, 1]) / 2 - middle[i, 1]
-                w = width[i]
-                value = -np.log(2 * np.pi * w * w)
-                value -= (tail / 2 + 1) * np.log1p((mx * mx + my * my) / (w * w * tail))
                 both = np.log(np.exp(shape[j, 0]) + np.exp(shape[h, 0]))
-                z = (np.log(apart) - both / 2 - separation[0]) / separation[1]
-                value -= 0.5 * z * z + np.log(separation[1] * np.sqrt(2 * np.pi))
-                value -= np.log(2 * np.pi * apart * apart)
-                z = (both - shape[i, 0] - ratios[0]) / ratios[1]
-                sizes = -0.5 * z * z - np.log(2 * np.pi * ratios[1] * ratios[2])
-                z = (shape[j, 0] - shape[h, 0]) / ratios[2]
-                sizes -= 0.5 * z * z
-                sizes -= population[j] + population[h]
-                value += np.log(1.0 - ratios[3] + ratios[3] * np.exp(sizes))
                 # Elongation along and across the line between the daughters.
                 along = (dx * dx - dy * dy) / (apart * apart)
                 across = 2.0 * dx * dy / (apart * apart)
-                for g, role in ((i, 0), (j, 1), (h, 1)):
-                    e = along * shape[g, 1] + across * shape[g, 2]
-                    o = along * shape[g, 2] - across * shape[g, 1]
-                    near = ((e - stretch[role, 0]) / stretch[role, 1]) ** 2
-                    near += (o / stretch[role, 2]) ** 2
-                    far = (e * e + o * o) / stretch[2, 1] ** 2
-                    value += (nu / 2 + 1) * (np.log1p(far / nu) - np.log1p(near / nu))
-                    value += np.log(stretch[2, 1] ** 2 / (stretch[role, 1] * stretch[role, 2]))
-                value += prior[i] - leave[i] - appear[j] - appear[h]
+                value = -np.inf
+                for m in range(len(prior)):
+                    w = width[m, i]
+                    one = prior[m, i] - np.log(2 * np.pi * w * w)
+                    one -= (tail / 2 + 1) * np.log1p((mx * mx + my * my) / (w * w * tail))
+                    z = (np.log(apart) - both / 2 - separation[m, 0]) / separation[m, 1]
+                    one -= 0.5 * z * z + np.log(separation[m, 1] * np.sqrt(2 * np.pi))
+                    r = ratios[m]
+                    z = (both - shape[i, 0] - r[0]) / r[1]
+                    sizes = -0.5 * z * z - np.log(2 * np.pi * r[1] * r[2])
+                    z = (shape[j, 0] - shape[h, 0]) / r[2]
+                    sizes -= 0.5 * z * z
+                    sizes -= population[j] + population[h]
+                    one += np.log(1.0 - r[3] + r[3] * np.exp(sizes))
+                    for g, role in ((i, 0), (j, 1), (h, 1)):
+                        law, any_cell = stretch[m, role], stretch[m, 2, 1]
+                        e = along * shape[g, 1] + across * shape[g, 2]
+                        o = along * shape[g, 2] - across * shape[g, 1]
+                        near = ((e - law[0]) / law[1]) ** 2 + (o / law[2]) ** 2
+                        far = (e * e + o * o) / any_cell**2
+                        one += (nu / 2 + 1) * (np.log1p(far / nu) - np.log1p(near / nu))
+                        one += np.log(any_cell**2 / (law[1] * law[2]))
+                    value = one if m == 0 else np.logaddexp(value, one)
+                value -= np.log(2 * np.pi * apart * apart)
+                value -= leave[i] + appear[j] + appear[h]
                 if value <= least or (last - first == most and value <= out_gain[last - 1]):
                     continue
                 place = last if last - first < most else last - 1

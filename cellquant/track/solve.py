@@ -17,7 +17,7 @@ from cellquant.track.costs import (
     paths,
 )
 from cellquant.track.cues import Cue, Look, evidence, fit_cue, joined
-from cellquant.track.divisions import Divisions, fit_divisions, log_frequency, propose
+from cellquant.track.divisions import Divisions, broken_masks, fit_divisions, log_frequency, propose
 from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
 from cellquant.track.flow import CANDIDATES, all_flows
 from cellquant.track.images import PairImages
@@ -177,6 +177,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         found, _ = nearest_cells(movie.position[a] + flow[a], movie.position[b], CANDIDATES)
         candidates[a] = np.where(found >= 0, found + movie.start[index + 1], -1)
     leaving, entering = places(movie, flow)
+    nobody = np.empty(0, dtype=np.int64)
     return Solution(
         movie=movie,
         flow=flow,
@@ -187,7 +188,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         known=_paths(movie, None, flow, carried, options),
         motion=first_motion(movie, flow, candidates),
         shapes=fit_shapes(movie, None, population_of(movie)),
-        rates=fit_rates(movie, None, leaving, entering),
+        rates=fit_rates(movie, None, nobody, leaving, entering),
         sizes=log_frequency(movie.shape[:, LOG_AREA]),
     )
 
@@ -219,7 +220,8 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
     )
     if options.use_shape:
         state.shapes = fit_shapes(movie, links, state.shapes.population)
-    state.rates = fit_rates(movie, links, state.leaving, state.entering)
+    broken, _ = broken_masks(movie, links)
+    state.rates = fit_rates(movie, links, broken, state.leaving, state.entering)
     if options.divisions and turn >= _DIVISION_PASS:
         # A first look may come before steps are known well enough to leave a daughter over.
         newcomers = int(np.sum(links.before[movie.start[1] :] < 0))
