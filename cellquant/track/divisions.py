@@ -17,6 +17,7 @@ _RARE = 1e-4
 _PATCH_FRAMES = 3  # for which a mask may be broken
 _PATCHED = 0.25  # of the logarithm of the area, by which a mask that was mended may differ
 _ENOUGH_BROKEN = 10
+_COUNTED = 0.02  # chance from which a family counts in a fit
 
 
 @dataclass(frozen=True)
@@ -41,33 +42,108 @@ class Divisions:
     log_broken: float
 
 
-def broken_masks(movie: Movie, links: Links) -> tuple[IntArray, IntArray]:
-    """Mothers whose two daughters are soon one cell again, of the size of both, and the daughter
-    that is left.
+@dataclass(frozen=True)
+class Families:
+    """Mothers and two daughters each, as indices into all cells (F, 3).
 
-    One daughter ends within three frames, and the next cell of the other is as large as both.
+    ``weight`` (F,) chance that each is one, given the links it competes with; ``chosen`` (F,)
+    whether it was taken.
     """
-    mothers = np.flatnonzero(links.second >= 0)
+
+    cells: IntArray
+    weight: FloatArray
+    chosen: BoolArray
+
+    def __getitem__(self, rows: BoolArray) -> "Families":
+        return Families(self.cells[rows], self.weight[rows], self.chosen[rows])
+
+
+def no_families() -> Families:
+    """Nobody has divided."""
+    return Families(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0, dtype=np.bool_))
+
+
+def weigh(
+    cells: IntArray,
+    odds: FloatArray,
+    split: IntArray,
+    source: IntArray,
+    target: IntArray,
+    candidates: IntArray,
+    gain: FloatArray,
+) -> Families:
+    """Chance of every family against the links, or the family, that were chosen in its stead.
+
+    A chosen family is weighed against its better link. Hard counts would find that divisions are
+    rare where they were missed, and miss them again.
+
+    Parameters
+    ----------
+    cells, odds
+        Families (F, 3) and their log odds (F,).
+    split
+        Indices of the chosen families.
+    source, target
+        (L,) ends of the chosen links.
+    candidates, gain
+        (N, K) candidate links and their log odds.
+    """
+    n = len(candidates)
+    chosen = np.zeros(len(cells), dtype=np.bool_)
+    chosen[split] = True
+
+    def worth(one: IntArray, two: IntArray) -> FloatArray:
+        found = np.where(candidates[one] == two[:, None], gain[one], -np.inf).max(axis=1)
+        return np.asarray(np.maximum(found, 0.0), dtype=np.float64)
+
+    # What each cell holds; a family that takes it away loses that, once per link or family.
+    out, into, partner = np.zeros(n), np.zeros(n), np.full(n, -1, dtype=np.int64)
+    out[source] = into[target] = worth(source, target)
+    partner[source] = target
+    for role, column in ((out, 0), (into, 1), (into, 2)):
+        role[cells[split, column]] = odds[split]
+    mother, one, two = cells.T
+    link_one, link_two = worth(mother, one), worth(mother, two)
+    lost = out[mother]
+    for daughter in (one, two):
+        lost = lost + np.where(partner[mother] == daughter, 0.0, into[daughter])
+    lost = np.where(chosen, np.maximum(link_one, link_two), lost)
+    better = np.exp(np.clip(odds - lost, -50.0, 50.0))
+    # Those that were not chosen share the chance of the cells that they have in common.
+    rivals = np.where(chosen, 0.0, better)
+    shared = np.zeros(len(cells))
+    for column in (mother, one, two):
+        shared = np.maximum(shared, np.bincount(column, rivals, n)[column])
+    weight: FloatArray = np.where(chosen, 1.0, better / (1.0 + shared))
+    keep = weight > _COUNTED
+    return Families(cells[keep], weight[keep], chosen[keep])
+
+
+def broken_masks(movie: Movie, links: Links, cells: IntArray) -> IntArray:
+    """The daughter (F,) that is left where the daughters of families (F, 3) are soon one cell
+    again, as large as both; -1 where they are not.
+
+    One of them ends within three frames, and the next cell of the other is as large as both.
+    """
     size = np.exp(movie.shape[:, LOG_AREA])
-    one, two = links.after[mothers], links.second[mothers]
-    left = np.full(len(mothers), -1, dtype=np.int64)
-    a, b = one.copy(), two.copy()
+    _, one, two = cells.T
+    left = np.full(len(cells), -1, dtype=np.int64)
+    a, b = one, two
     for _ in range(_PATCH_FRAMES):
         for stays, first, ends in ((a, one, b), (b, two, a)):
             following = links.after[stays]
             whole = (following >= 0) & (links.after[ends] < 0) & (left < 0)
             whole &= (stays >= 0) & (ends >= 0) & (links.second[stays] < 0)
-            ratio = np.log(size[following] / (size[stays] + size[ends]))
-            left[whole & (np.abs(ratio) < _PATCHED)] = first[whole & (np.abs(ratio) < _PATCHED)]
-        a = np.where((a >= 0) & (links.second[a] < 0), links.after[a], -1)
-        b = np.where((b >= 0) & (links.second[b] < 0), links.after[b], -1)
-    found = left >= 0
-    return mothers[found], left[found]
+            change = np.abs(np.log(size[following] / (size[stays] + size[ends])))
+            left = np.where(whole & (change < _PATCHED), first, left)
+        a, b = (np.where((c >= 0) & (links.second[c] < 0), links.after[c], -1) for c in (a, b))
+    return left
 
 
 def fit_divisions(
     movie: Movie,
-    links: Links | None,
+    families: Families,
+    broken: BoolArray,
     middle: FloatArray,
     population: FloatArray,
     *,
@@ -77,48 +153,41 @@ def fit_divisions(
 ) -> Divisions:
     """Estimate the daughters' geometry from the families found, with a weak general prior.
 
-    `population` (N,) is the `log_frequency` of the cells' sizes. `width`, `tail` and `spread` (N,)
-    are those of single cells' steps around `middle` (N, 2), where they are expected.
+    `broken` (F,) are families that are one cell again. `population` (N,) is the `log_frequency` of
+    the cells' sizes. `width`, `tail` and `spread` (N,) are those of single cells' steps around
+    `middle` (N, 2), where they are expected.
     """
-    nobody = np.empty(0, dtype=np.int64)
-    mothers, broken = nobody, nobody
-    if links is not None:
-        mothers = np.flatnonzero(links.second >= 0)
-        broken, _ = broken_masks(movie, links)
-    if len(broken) < _ENOUGH_BROKEN:
-        broken = nobody
-    kinds = [np.setdiff1d(mothers, broken)]
-    if len(broken):
-        kinds.append(broken)
+    enough = families.weight[broken].sum() >= _ENOUGH_BROKEN
+    kinds = [~broken, broken] if enough else [~broken]
     centre = float(np.median(movie.shape[:, LOG_AREA]))
     apart = float(np.log(0.85 * np.median(movie.spacing)) - centre / 2 - 0.15)
     separation, ratios, stretch, widths = [], [], [], []
-    for mothers in kinds:
-        one, two = mothers, mothers
-        if links is not None:
-            one, two = links.after[mothers], links.second[mothers]
-        found = _fit_kind(movie, mothers, one, two, apart, population)
+    for kind in kinds:
+        (mother, one, two), weight = families.cells[kind].T, families.weight[kind]
+        found = _fit_kind(movie, mother, one, two, weight, apart, population)
         separation.append(found[0])
         ratios.append(found[1])
-        stretch.append(_fit_stretch(movie, mothers, one, two))
-        place = (movie.position[one] + movie.position[two]) / 2 - middle[mothers]
-        square = np.sum(place**2, axis=1) / spread[mothers] ** 2
-        widths.append(_robust_width(square, 1.5 * width, tail))
+        stretch.append(_fit_stretch(movie, mother, one, two, weight))
+        place = (movie.position[one] + movie.position[two]) / 2 - middle[mother]
+        square = np.sum(place**2, axis=1) / spread[mother] ** 2
+        widths.append(_robust_width(square, weight, 1.5 * width, tail))
+    number = float(families.weight[broken].sum())
     return Divisions(
         separation=np.array(separation),
         ratios=np.array(ratios),
         stretch=np.array(stretch),
         width=np.array(widths),
         population=population,
-        log_broken=float(np.log((len(broken) + 0.5) / (movie.n_cells + 1.0))),
+        log_broken=float(np.log((number + 0.5) / (movie.n_cells + 1.0))),
     )
 
 
 def _fit_kind(
     movie: Movie,
-    mothers: IntArray,
+    mother: IntArray,
     one: IntArray,
     two: IntArray,
+    weight: FloatArray,
     usual: float,
     population: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
@@ -126,10 +195,10 @@ def _fit_kind(
     area = movie.shape[:, LOG_AREA]
     both = np.logaddexp(area[one], area[two])
     apart = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T)) - both / 2
-    total = both - area[mothers]
+    total = both - area[mother]
     ratio = area[one] - area[two]
-    total_fit = _normal(total, 0.3, 0.35, 0.1)
-    uneven = _normal(ratio, 0.0, 0.3, 0.1, fixed=True)[1]
+    total_fit = _normal(total, weight, 0.3, 0.35, 0.1)
+    uneven = _normal(ratio, weight, 0.0, 0.3, 0.1, fixed=True)[1]
     # How often the sizes of daughters are told better by these laws than by the population.
     family = _log_normal(total, *total_fit) + _log_normal(ratio, 0.0, uneven)
     family -= population[one] + population[two]
@@ -137,22 +206,24 @@ def _fit_kind(
     informative = 0.5
     for _ in range(20):
         share = informative * ratio_of / (informative * ratio_of + 1.0 - informative)
-        informative = (float(share.sum()) + 1.0) / (len(mothers) + 2.0)
-    separation = _normal(apart, usual, 0.3, 0.1)
+        informative = (float(weight @ share) + 1.0) / (float(weight.sum()) + 2.0)
+    separation = _normal(apart, weight, usual, 0.3, 0.1)
     return np.array(separation), np.array([*total_fit, uneven, informative])
 
 
-def _robust_width(square: FloatArray, prior: float, tail: float) -> float:
-    """Scale of a two-dimensional Student density from squared distances (D,)."""
+def _robust_width(square: FloatArray, each: FloatArray, prior: float, tail: float) -> float:
+    """Scale of a two-dimensional Student density from squared distances (D,), weighted."""
     width = prior
     for _ in range(10):
-        weight = (tail + 2.0) / (tail + square / width**2)
+        weight = each * (tail + 2.0) / (tail + square / width**2)
         total = np.sum(weight * square) / 2 + _PRIOR_DIVISIONS * prior**2
-        width = float(np.sqrt(total / (len(square) + _PRIOR_DIVISIONS)))
+        width = float(np.sqrt(total / (each.sum() + _PRIOR_DIVISIONS)))
     return width
 
 
-def _fit_stretch(movie: Movie, mothers: IntArray, one: IntArray, two: IntArray) -> FloatArray:
+def _fit_stretch(
+    movie: Movie, mother: IntArray, one: IntArray, two: IntArray, weight: FloatArray
+) -> FloatArray:
     elongation = movie.shape[:, 1:3]
     width = max(float(np.sqrt(np.mean(elongation**2))), _STRETCH_FLOOR)
     line = movie.position[two] - movie.position[one]
@@ -160,24 +231,28 @@ def _fit_stretch(movie: Movie, mothers: IntArray, one: IntArray, two: IntArray) 
     along = np.column_stack((np.cos(angle), np.sin(angle)))
     across = np.column_stack((-np.sin(angle), np.cos(angle)))
     stretch = np.array([[0.0, width, width]] * 3)
-    for role, cells in ((0, (mothers,)), (1, (one, two))):
+    for role, cells in ((0, (mother,)), (1, (one, two))):
         e = np.concatenate([np.sum(along * elongation[c], axis=1) for c in cells])
         o = np.concatenate([np.sum(across * elongation[c], axis=1) for c in cells])
-        stretch[role, :2] = _normal(e, 0.0, width, _STRETCH_FLOOR)
-        stretch[role, 2] = _normal(o, 0.0, width, _STRETCH_FLOOR, fixed=True)[1]
+        each = np.tile(weight, len(cells))
+        stretch[role, :2] = _normal(e, each, 0.0, width, _STRETCH_FLOOR)
+        stretch[role, 2] = _normal(o, each, 0.0, width, _STRETCH_FLOOR, fixed=True)[1]
     return stretch
 
 
 def _normal(
-    values: FloatArray, mean: float, deviation: float, floor: float, *, fixed: bool = False
+    values: FloatArray,
+    weight: FloatArray,
+    mean: float,
+    deviation: float,
+    floor: float,
+    *,
+    fixed: bool = False,
 ) -> tuple[float, float]:
-    n = len(values)
-    centre = mean
-    if not fixed:
-        centre = (float(values.sum()) + _PRIOR_DIVISIONS * mean) / (n + _PRIOR_DIVISIONS)
-    square = float(np.sum((values - centre) ** 2))
-    variance = (square + _PRIOR_DIVISIONS * deviation**2) / (n + _PRIOR_DIVISIONS)
-    return centre, max(float(np.sqrt(variance)), floor)
+    n = float(weight.sum()) + _PRIOR_DIVISIONS
+    centre = mean if fixed else (float(weight @ values) + _PRIOR_DIVISIONS * mean) / n
+    square = float(weight @ (values - centre) ** 2)
+    return centre, max(float(np.sqrt((square + _PRIOR_DIVISIONS * deviation**2) / n)), floor)
 
 
 def log_frequency(values: FloatArray) -> FloatArray:

@@ -65,11 +65,16 @@ def places(movie: Movie, flow: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 def fit_rates(
-    movie: Movie, links: Links | None, broken: IntArray, leaving: IntArray, entering: IntArray
+    movie: Movie,
+    links: Links | None,
+    divided: FloatArray,
+    born: FloatArray,
+    leaving: IntArray,
+    entering: IntArray,
 ) -> Rates:
     """Chances to vanish, appear and divide from counts, each with a weak prior.
 
-    `broken` are mothers whose masks only fell apart for a while, which is no division.
+    `divided` (N,) is the chance that each cell divides, and `born` (N,) that it is a daughter.
 
     Frames differ: the interval may be uneven, or many cells die at once. Every frame is drawn
     towards the mean over the movie, the more the better that mean explains all frames.
@@ -80,21 +85,20 @@ def fit_rates(
         return Rates(first, first, np.full(n_frames, _FIRST_DIVISIONS))
     frames = movie.frame_index
 
-    def rate(event: BoolArray, among: BoolArray) -> FloatArray:
-        events = np.bincount(frames[event & among], minlength=n_frames).astype(np.float64)
+    def rate(event: FloatArray, among: BoolArray) -> FloatArray:
+        events = np.bincount(frames[among], event[among], n_frames).astype(np.float64)
         cells = np.bincount(frames[among], minlength=n_frames).astype(np.float64)
         return _by_frame(events, cells)
 
     cell = np.arange(movie.n_cells)
     may_leave, may_enter = cell < movie.start[-2], cell >= movie.start[1]
-    gone, new = links.after < 0, links.before < 0
-    divided = links.second >= 0
-    divided[broken] = False
+    gone: FloatArray = np.where(links.after < 0, 1.0, 0.0)
+    # If a division was none, one of the two daughters has appeared.
+    daughter = (links.before >= 0) & (links.second[links.before] >= 0)
+    new = np.where(links.before < 0, 1.0 - born, np.where(daughter, (1.0 - born) / 2, 0.0))
     vanish = [rate(gone, may_leave & (leaving == place)) for place in range(PLACES)]
     appear = [rate(new, may_enter & (entering == place)) for place in range(PLACES)]
-    return Rates(
-        np.column_stack(vanish), np.column_stack(appear), rate(divided, may_leave)
-    )
+    return Rates(np.column_stack(vanish), np.column_stack(appear), rate(divided, may_leave))
 
 
 def _by_frame(events: FloatArray, cells: FloatArray) -> FloatArray:

@@ -17,7 +17,16 @@ from cellquant.track.costs import (
     paths,
 )
 from cellquant.track.cues import Cue, Look, evidence, fit_cue, joined
-from cellquant.track.divisions import Divisions, broken_masks, fit_divisions, log_frequency, propose
+from cellquant.track.divisions import (
+    Divisions,
+    Families,
+    broken_masks,
+    fit_divisions,
+    log_frequency,
+    no_families,
+    propose,
+    weigh,
+)
 from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
 from cellquant.track.flow import CANDIDATES, all_flows
 from cellquant.track.images import PairImages
@@ -29,8 +38,8 @@ from cellquant.track.shapes import Shapes, fit_shapes, population_of
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
 
-PASSES, MOST_PASSES = 5, 10
-_STILL, _NEARLY_STILL = 0.003, 0.03  # share of links that a pass changes: end of passes, averaging
+PASSES, MOST_PASSES = 5, 9
+_STILL, _NEARLY_STILL = 0.003, 0.1  # share of links that a pass changes: end of passes, averaging
 _UNLIKELY = 1e-4  # links below this probability are not offered to the assignment
 _MARGIN = 3.0  # of log odds below that, where links no longer matter to their rivals
 _SWEEPS = 6  # of belief propagation
@@ -71,6 +80,8 @@ class Solution:
     rates: Rates
     sizes: FloatArray
     links: Links | None = None
+    families: Families = field(default_factory=no_families)
+    broken: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     divisions: Divisions | None = None
     probability: FloatArray | None = None
     looked: IntArray | None = None
@@ -151,7 +162,8 @@ def solve(
         if options.divisions and turn >= _DIVISION_PASS:
             state.divisions = fit_divisions(
                 movie,
-                state.links,
+                state.families[state.families.chosen],
+                state.broken[state.families.chosen],
                 middle,
                 state.sizes,
                 spread=state.motion.spread * np.sqrt(movie.elapsed),
@@ -177,7 +189,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         found, _ = nearest_cells(movie.position[a] + flow[a], movie.position[b], CANDIDATES)
         candidates[a] = np.where(found >= 0, found + movie.start[index + 1], -1)
     leaving, entering = places(movie, flow)
-    nobody = np.empty(0, dtype=np.int64)
+    nobody = np.zeros(movie.n_cells)
     return Solution(
         movie=movie,
         flow=flow,
@@ -188,7 +200,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         known=_paths(movie, None, flow, carried, options),
         motion=first_motion(movie, flow, candidates),
         shapes=fit_shapes(movie, None, population_of(movie)),
-        rates=fit_rates(movie, None, nobody, leaving, entering),
+        rates=fit_rates(movie, None, nobody, nobody, leaving, entering),
         sizes=log_frequency(movie.shape[:, LOG_AREA]),
     )
 
@@ -220,8 +232,19 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
     )
     if options.use_shape:
         state.shapes = fit_shapes(movie, links, state.shapes.population)
-    broken, _ = broken_masks(movie, links)
-    state.rates = fit_rates(movie, links, broken, state.leaving, state.entering)
+    families = state.families
+    state.broken = broken_masks(movie, links, families.cells) >= 0
+    divided, born = np.zeros(movie.n_cells), np.zeros(movie.n_cells)
+    np.add.at(divided, families.cells[~state.broken, 0], families.weight[~state.broken])
+    np.add.at(born, families.cells[:, 1:], families.weight[:, None])
+    state.rates = fit_rates(
+        movie,
+        links,
+        np.minimum(divided, 1.0),
+        np.minimum(born, 1.0),
+        state.leaving,
+        state.entering,
+    )
     if options.divisions and turn >= _DIVISION_PASS:
         # A first look may come before steps are known well enough to leave a daughter over.
         newcomers = int(np.sum(links.before[movie.start[1] :] < 0))
@@ -312,6 +335,7 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
         np.maximum.at(reached, column, sure)
         families, odds, looks = _families(state, reached < _SURE, middle, images)
     chosen, split = match_with_divisions(row, column, gain[row, slot], families, odds)
+    state.families = weigh(families, odds, split, row[chosen], column[chosen], candidates, gain)
     if looks:
         taken = np.zeros(len(odds), dtype=bool)
         taken[split] = True
