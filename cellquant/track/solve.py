@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack
 
 PASSES, MOST_PASSES = 5, 9
-_STILL, _NEARLY_STILL = 0.003, 0.1  # share of links that a pass changes: end of passes, averaging
+# Share of links that a pass changes: below the second there are more passes, until the first.
+_STILL, _NEARLY_STILL = 0.003, 0.1
 _UNLIKELY = 1e-4  # links below this probability are not offered to the assignment
 _MARGIN = 3.0  # of log odds below that, where links no longer matter to their rivals
 _SWEEPS = 6  # of belief propagation
@@ -127,7 +128,7 @@ def solve(
     changed = 1.0
     if progress is not None:
         progress(frames // total, frames)
-    while turn < PASSES or (turn < MOST_PASSES and changed > _STILL):
+    while turn < PASSES or (turn < MOST_PASSES and _STILL < changed < _NEARLY_STILL):
         if state.links is not None:
             _refit(state, options, turn)
         state.fates = fates(movie, state.links, state.rates, state.leaving, state.entering)
