@@ -16,13 +16,15 @@ from scipy.optimize import linear_sum_assignment
 import cellquant as cq
 from cellquant.errors import InputError
 from cellquant.io import LabelStack, read_images, read_labels
+from cellquant.segment import measure_cells
 from cellquant.tables import PIXEL, TRACK_COLUMNS, Cells
 from cellquant.track import track_cells
 from cellquant.track.assign import match, match_with_divisions
-from cellquant.track.divisions import log_frequency
+from cellquant.track.divisions import broken_masks, log_frequency, weigh
 from cellquant.track.evaluate import evaluate
+from cellquant.track.flow import pair_flow
 from cellquant.track.kernels import marginals
-from cellquant.track.movie import flatten
+from cellquant.track.movie import Links, flatten
 from cellquant.track.near import nearest_cells
 from cellquant.track.solve import Options, solve
 
@@ -288,6 +290,50 @@ def test_rare_sizes_are_as_rare_as_they_occur() -> None:
     assert np.median(normal[:20]) < -15.0
     assert (log_density[:20] > -7.0).all()
     assert np.median(np.abs(log_density[20:] - normal[20:])) < 0.5
+
+
+def test_a_mask_that_falls_apart_is_no_division() -> None:
+    masks = np.zeros((3, 20, 40), dtype=np.int32)
+    masks[:, 5:15, 5:15] = 1
+    masks[1:, 5:15, 10:15] = 2
+    masks[2, 5:15, 5:15] = 1
+    masks[:, 5:15, 25:35] = 3
+    masks[1:, 5:15, 30:35] = 4
+    movie = flatten(measure_cells(stack_of(masks)))
+    order = np.lexsort((movie.label, movie.frame))
+    whole, other, half, rest, part, twin, again, stays, goes = order.tolist()
+    after = np.full(9, -1)
+    after[[whole, other, half, part, twin]] = half, part, again, stays, goes
+    links = Links(after, np.full(9, -1), np.full(9, -1), np.ones(9))
+    families = np.array([[whole, half, rest], [whole, rest, half], [other, part, twin]])
+    assert broken_masks(movie, links, families).tolist() == [half, half, -1]
+
+
+def test_a_family_is_weighed_against_the_links_it_would_break() -> None:
+    candidates = np.array([[2, 3], [3, 4], [-1, -1], [-1, -1], [-1, -1]])
+    gain = np.array([[5.0, 1.0], [4.0, 3.0]] + [[-np.inf, -np.inf]] * 3)
+    cells = np.array([[0, 2, 4], [1, 3, 4]])
+    odds = np.array([5.5, 2.0])
+    nobody = np.empty(0, dtype=np.int64)
+    found = weigh(cells, odds, nobody, np.array([0, 1]), np.array([2, 3]), candidates, gain)
+    better = np.exp(odds - np.array([5.0, 4.0]))
+    np.testing.assert_allclose(found.weight, better / (1.0 + better.sum()))
+    taken = weigh(cells, odds, np.array([0]), np.array([1]), np.array([3]), candidates, gain)
+    assert taken.chosen.tolist()[0]
+    assert taken.weight[0] == 1.0
+
+
+def test_flow_is_followed_where_it_shows_and_small_where_nothing_can_be_told() -> None:
+    rng = np.random.default_rng(5)
+    grid = 10.0 * np.stack(np.meshgrid(range(20), range(20)), axis=-1).reshape(-1, 2)
+    here = grid + rng.normal(0, 1.5, grid.shape)
+    shift = np.array([7.0, 3.0])
+    strangers = rng.random(here.shape) * 200.0
+    for there, expected, error in ((here + shift, shift, 0.5), (strangers, 0.0 * shift, 2.0)):
+        movie = flatten(replace(cells_at([here, there]), field_of_view=(200.0, 200.0)))
+        flow = pair_flow(movie, 0, np.zeros_like(here))
+        inside = movie.margin[movie.cells_of(0)] > 30.0
+        assert np.abs(flow[inside] - expected).max() < error
 
 
 def test_steps_scatter_more_in_a_frame_with_a_jolt() -> None:

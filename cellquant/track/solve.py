@@ -177,9 +177,23 @@ def solve(
         turn += 1
         if progress is not None:
             progress(frames * (turn - first + 1) // total, frames)
+    if state.divisions is not None and len(state.divisions.width) > 1:
+        state.links = _mended(movie, state.links)
     if progress is not None:
         progress(frames, frames)
     return state
+
+
+def _mended(movie: Movie, links: Links) -> Links:
+    """Links where a mother whose mask only fell apart goes on in the part that is left."""
+    mother = np.flatnonzero(links.second >= 0)
+    one, two = links.after[mother], links.second[mother]
+    left = broken_masks(movie, links, np.column_stack((mother, one, two)))
+    found = left >= 0
+    mother, left, lost = mother[found], left[found], np.where(left == one, two, one)[found]
+    after, second, before = links.after.copy(), links.second.copy(), links.before.copy()
+    after[mother], second[mother], before[lost] = left, -1, -1
+    return replace(links, after=after, second=second, before=before)
 
 
 def _start(movie: Movie, options: Options) -> Solution:
