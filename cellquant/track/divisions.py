@@ -16,7 +16,7 @@ _SIZE_BLUR = 0.1  # of the logarithm of the area
 _RARE = 1e-4
 _PATCH_FRAMES = 3  # for which a mask may be broken
 _PATCHED = 0.25  # of the logarithm of the area, by which a mask that was mended may differ
-_ENOUGH_BROKEN = 10
+_ENOUGH_BROKEN, _BROKEN_SHARE = 10, 0.1  # families that speak for masks that break
 _COUNTED = 0.02  # chance from which a family counts in a fit
 
 
@@ -140,6 +140,14 @@ def broken_masks(movie: Movie, links: Links, cells: IntArray) -> IntArray:
     return left
 
 
+def are_broken(movie: Movie, links: Links, families: Families) -> BoolArray:
+    """Whether the masks of the families (F,) fall apart for a while; nobody's where that is rare,
+    since a daughter may also be lost by chance."""
+    found = broken_masks(movie, links, families.cells) >= 0
+    number, total = float(families.weight[found].sum()), float(families.weight.sum())
+    return found & (number >= max(_ENOUGH_BROKEN, _BROKEN_SHARE * total))
+
+
 def fit_divisions(
     movie: Movie,
     families: Families,
@@ -157,8 +165,8 @@ def fit_divisions(
     the cells' sizes. `width`, `tail` and `spread` (N,) are those of single cells' steps around
     `middle` (N, 2), where they are expected.
     """
-    enough = families.weight[broken].sum() >= _ENOUGH_BROKEN
-    kinds = [~broken, broken] if enough else [~broken]
+    number = float(families.weight[broken].sum())
+    kinds = [~broken, broken] if broken.any() else [~broken]
     centre = float(np.median(movie.shape[:, LOG_AREA]))
     apart = float(np.log(0.85 * np.median(movie.spacing)) - centre / 2 - 0.15)
     separation, ratios, stretch, widths = [], [], [], []
@@ -171,7 +179,6 @@ def fit_divisions(
         place = (movie.position[one] + movie.position[two]) / 2 - middle[mother]
         square = np.sum(place**2, axis=1) / spread[mother] ** 2
         widths.append(_robust_width(square, weight, 1.5 * width, tail))
-    number = float(families.weight[broken].sum())
     return Divisions(
         separation=np.array(separation),
         ratios=np.array(ratios),

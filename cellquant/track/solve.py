@@ -20,6 +20,7 @@ from cellquant.track.cues import Cue, Look, evidence, fit_cue, joined
 from cellquant.track.divisions import (
     Divisions,
     Families,
+    are_broken,
     broken_masks,
     fit_divisions,
     log_frequency,
@@ -177,7 +178,7 @@ def solve(
         turn += 1
         if progress is not None:
             progress(frames * (turn - first + 1) // total, frames)
-    if state.divisions is not None and len(state.divisions.width) > 1:
+    if state.links is not None and state.divisions is not None and len(state.divisions.width) > 1:
         state.links = _mended(movie, state.links)
     if progress is not None:
         progress(frames, frames)
@@ -248,7 +249,7 @@ def _refit(state: Solution, options: Options, turn: int) -> None:
     if options.use_shape:
         state.shapes = fit_shapes(movie, links, state.shapes.population)
     families = state.families
-    state.broken = broken_masks(movie, links, families.cells) >= 0
+    state.broken = are_broken(movie, links, families)
     divided, born = np.zeros(movie.n_cells), np.zeros(movie.n_cells)
     np.add.at(divided, families.cells[~state.broken, 0], families.weight[~state.broken])
     np.add.at(born, families.cells[:, 1:], families.weight[:, None])
