@@ -17,9 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import skew
 
 from cellquant.observables import observe
 from cellquant.sim import Scene, open_run, simulate
+from cellquant.sim.shapes import pinched, shape_indices
 from cellquant.tables import TRACK_COLUMNS
 
 RESULTS = Path(__file__).parent / "results"
@@ -35,7 +37,17 @@ LONG = 20_000.0  # t0 that a run may go on for; it is measured whenever one like
 SAVE_EVERY = 5.0
 FRESH_NOISE = 1000  # added to the seed of runs that start from another's last state
 LEAST = 300.0  # t0 below which a run is not measured
-KEYS = ("p", "drift", "tau_alpha", "sigma2", "xi", "pinched_share", "length", "transient")
+KEYS = (
+    "p",
+    "drift",
+    "tau_alpha",
+    "sigma2",
+    "xi",
+    "pinched_share",
+    "skewness",
+    "length",
+    "transient",
+)
 
 
 def go_on(options):
@@ -104,12 +116,18 @@ def measure(path):
         "sigma2": hove.get("sigma2"),
         "xi": hove.get("xi"),
         "pinched_share": float(np.mean(pinched_share(run)[start:])),
+        "skewness": float(skew(shapes_of_cells(run, start))),
     }
 
 
-def pinched_share(run):
-    from cellquant.sim.shapes import pinched
+def shapes_of_cells(run, start):
+    """Shape index of every cell at a hundred frames of the steady part."""
+    frames = np.linspace(start, run.n_frames - 1, 100).astype(int)
+    return np.concatenate([shape_indices(run.modes[t]) for t in frames])
 
+
+def pinched_share(run):
+    """Share of pinched cells at every frame."""
     modes = run.modes
     return np.array([pinched(modes[t]).mean() for t in range(run.n_frames)])
 

@@ -211,8 +211,8 @@ def main():
             "'steady' counts the seeds for which there is one, else the second half is measured). "
             "Errors are standard errors over seeds. sigma^2 is the mean square displacement of "
             "the core, exp(-r^2/sigma^2), at tau_alpha in d^2, xi the decay length of the tail in "
-            "d. exact: the recommended scheme; 40points: the published scheme, Euler 0.005. The "
-            "publication has N = 1024 and windows up to 2e5 t0.\n"
+            "d, skew the skewness of P(p). exact: the recommended scheme; 40points: the published "
+            "scheme, Euler 0.005. The publication has N = 1024 and windows up to 2e5 t0.\n"
         )
         rows = [
             [r["rule"], r["started_from"], str(r["cells"]), f"{r['phi']}, {r['v0']}, {r['eta']}"]
@@ -225,13 +225,13 @@ def main():
                     ("p", 4), ("drift", 2), ("tau_alpha", 3), ("sigma2", 3), ("xi", 3)
                 )
             ]
-            + [number(r.get("pinched_share"), 2)]
+            + [number(r.get("skewness"), 2), number(r.get("pinched_share"), 2)]
             + [", ".join(f"{k} {v}" for k, v in r["published"].items()) or "-"]
             for r in published["table"]
         ]  # fmt: skip
         header = [
             "rule", "start", "N", "phi, v0, eta", "steady", "length / t0", "transient", "<p>",
-            "drift", "tau_alpha", "sigma^2", "xi", "pinched", "published",
+            "drift", "tau_alpha", "sigma^2", "xi", "skew", "pinched", "published",
         ]  # fmt: skip
         parts.append(table(header, rows))
         parts.append(NOTES)

@@ -103,10 +103,7 @@ def keep_areas(record: Any, radius: Any, n_modes: int, cells: Any, weights: Any)
 def resample(
     record: Any, i: int, radius: float, n_modes: int, rho: Any, slope: Any, spacing: float
 ) -> None:
-    """Sample a contour anew at directions `spacing` apart, and renew its largest and least radius.
-
-    Rows longer than once round go on with the samples from the beginning.
-    """
+    """Sample a contour at directions `spacing` apart; renew its largest and least radius."""
     bend = 0.0
     for m in range(n_modes):
         bend += (m + 2.0) ** 2 * math.hypot(record[i, HEAD + m], record[i, HEAD + n_modes + m])
