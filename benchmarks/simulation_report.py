@@ -119,6 +119,11 @@ def main():
         if speed.get("features"):
             rows = [[name, number(ratio)] for name, ratio in speed["features"].items()]
             parts.append(table(["scene", "specialised / general time"], rows))
+            parts.append(
+                "A passive or monodisperse scene has no term to spare: its speed is one number, "
+                "and its radii are read as those of any other. Torques cost two products per "
+                "crossing, which wait for nothing.\n"
+            )
     if steps:
         parts.append("## Error against run time\n")
         parts.append(

@@ -17,6 +17,7 @@ from cellquant.sim.initial import initial_state
 from cellquant.sim.integrators import Implicit
 from cellquant.sim.noise import BrownianTree
 from cellquant.sim.scene import Scene
+from cellquant.sim.steps import FixedSteps, Plan
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -206,6 +207,13 @@ def scaling():
     return table
 
 
+def steps(scene, state, radius, box):
+    """A job: sixteen implicit steps of 0.1 t0 from a state."""
+    plan = Plan.of(1.6, 0.0, 1.6, 0.1)
+    walk = FixedSteps(Layer(scene, radius, box), "implicit", plan)
+    return lambda: walk.advance(state.copy(), 0)
+
+
 def features():
     """Specialised against general kernels on scenes that lack a term."""
     numba.set_num_threads(1)
@@ -222,6 +230,12 @@ def features():
             "general": evaluation(Layer(scene, radius, box, general=True), state),
         })  # fmt: skip
         table[name] = found["lean"][0] / found["general"][0]
+    state, radius, box = settle(Scene(n_cells=1024), 20.0)
+    found = in_turns({
+        name: steps(Scene(n_cells=1024, D_r=noise), state, radius, box)
+        for name, noise in (("lean", 0.0), ("general", 1e-30))
+    })  # fmt: skip
+    table["noiseless (whole steps)"] = found["lean"][0] / found["general"][0]
     discs = Scene(n_cells=1024, modes=1)
     state, radius, box = initial_state(discs)
     general = np.zeros((1024, 13))
