@@ -31,6 +31,7 @@ PUBLISHED = {
 }
 RULES = {
     "exact": {"contact": "exact"},
+    "exact_fine": {"contact": "exact", "dt": 0.025},
     "40points": {"contact": "quadrature", "integrator": "euler", "dt": 0.005},
 }
 LONG = 20_000.0  # t0 that a run may go on for; it is measured whenever one likes
@@ -85,7 +86,7 @@ def measure(path):
     """Shape index, its drift, and the relaxation of the steady part of one run."""
     run = open_run(path)
     scene = run.scene
-    rule = "exact" if run.settings["contact"] == "exact" else "40points"
+    rule = path.stem.rsplit("_", 5)[0]
     start, test = steady_part(run)
     shapes = ("perimeter", "shape_index", "aspect_ratio", "orientation", "n_neighbours")
     tracks = run.to_tracks(columns=[name for name in TRACK_COLUMNS if name not in shapes])
