@@ -190,3 +190,23 @@ def test_a_cell_beyond_the_closed_form_is_pushed_back(contact):
         tolerance = 1e-5 if contact == "exact" else 3e-3
         slope = -(ahead - behind) / (2 * step)
         assert np.sum(force * direction) == pytest.approx(slope, abs=tolerance)
+
+
+@pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1, 3))])
+def test_a_passive_layer_opens_closed_waists_and_its_energy_never_rises(seed):
+    """In short steps a rise is a contact that the search of crossings missed for a moment."""
+    from cellquant.sim.integrators import METHODS
+    from cellquant.sim.shapes import pinched
+
+    layer, state, radius, box = layer_with_pinches(seed, eta=0.05, waist=-0.3)
+    still = Layer(layer.scene.replace(D_r=0.0), radius, box)
+    method = METHODS["euler"].make(still)
+    zero = np.zeros(len(state))
+    closed = [pinched(state[:, 3:].reshape(len(state), 2, -1)).sum()]
+    energy = [still.energies(state).sum()]
+    for _ in range(10_000):
+        method.step(state, 0.0005, zero, zero)
+        energy.append(still.energies(state).sum())
+    closed.append(pinched(state[:, 3:].reshape(len(state), 2, -1)).sum())
+    assert closed == [2, 0]
+    assert np.diff(energy).max() <= 0.0

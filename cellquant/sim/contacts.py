@@ -229,10 +229,10 @@ class Layer:
         reference = self._record[:, [0, 1, 3]] if self._reference is None else self._reference
         age, fault, narrowest = neighbours.inspect(self._record, reference)
         self._narrow = self._parted = NONE
-        if (fault >= 0 or narrowest < 2.0 * pinches.NARROW) and not self.scene.rigid:
+        if (fault >= 0 or narrowest < 4.0 * pinches.SHARP) and not self.scene.rigid:
             self._keep_areas()
             age, fault, _ = neighbours.inspect(self._record, reference)
-            self._narrow = np.flatnonzero(self._record[:, 4] < pinches.NARROW * self.radius)
+            self._narrow = np.flatnonzero(self._record[:, 4] < pinches.SHARP * self.radius)
         self._check(fault)
         if len(self._narrow) and tension:
             pinches.measure_lengths(self._record, self._narrow, len(self._modes), self._tangent)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from cellquant.sim.grazes import FLAGS, gap, search_closely, settle
+from cellquant.sim.grazes import FLAGS, gap, search_closely, search_gap, settle
 from cellquant.sim.lanes import (
     LANES,
     peek,
@@ -40,6 +40,7 @@ from cellquant.sim.sampling import (
 ROOT = 8  # columns of a root: unit vectors on i and on j, rho on i and on j, error, angle
 LISTED = 4 * FULL + 4 * LANES  # gaps, second crossings, and what to polish again
 NARROW = 0.1  # smallest radius over A0 for which single precision is trusted
+MOST_OF_A_GAP = 64  # crossings, where it is searched in double precision
 SETTLED = 2e-9  # error of an angle that needs no further steps
 OVERFLOW = 1  # more crossings than the buffer holds
 
@@ -109,7 +110,9 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
     lines = lines_of[part]
     scratch = np.empty((2 * len(modes) + 4) * LANES)
     stack = np.empty((40, 6))
-    found = np.empty((8 * size, 4))
+    found = np.empty((8 * size, 5))
+    brackets = np.empty((8 * size, 5))
+    pair_of = np.empty(8 * size, np.int64)
     for block in range(n_blocks):
         if not part * n_blocks <= block * n_parts < (part + 1) * n_blocks:
             continue
@@ -147,14 +150,16 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
             listed = other[begin : begin + filled]
             find_windows(near, start, count, filled, modes)
             sample_pairs(
-                grid, rim, pattern, owner, listed, near, start, count, filled, modes, depth, change
-            )
+                grid, rim, pattern, owner, listed, near, start, count, filled, modes, depth, change,
+                code,
+            )  # fmt: skip
             n_gaps = list_gaps(
                 pattern, owner, listed, start, count, filled, size, stride, depth, change,
                 place, weight, mean, rows, code,
             )  # fmt: skip
             # First the first crossing of every gap; those with two are then listed once more.
             n_listed = n_gaps
+            n_apart = 0
             for second in range(2):
                 judge_gaps(
                     depth, change, place, weight, mean, second * n_gaps,
@@ -165,10 +170,23 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                 for g in range(n_gaps):
                     number = int(peek(kind, g))
                     k = peek(rows, LISTED + g) >> 2
+                    if number >= UNSURE and code[k] != CLOSELY:
+                        after = -1
+                        if number == UNSURE and n_apart + MOST_OF_A_GAP <= brackets.shape[0]:
+                            after = search_gap(
+                                record, owner[k], listed[k], apart[k, 0], apart[k, 1], compass,
+                                rows[0, g] >> 2, depth[place[g]], depth[place[g] + 1], modes,
+                                stack, brackets, n_apart,
+                            )  # fmt: skip
+                        if after < 0:
+                            code[k] = CLOSELY
+                        else:
+                            pair_of[n_apart:after] = k
+                            number = after - n_apart
+                            n_apart = after
+                            kind[g] = 0.0
                     poke(total, k, peek(total, k) + number)
-                    if number == UNSURE:
-                        code[k] = CLOSELY
-                    elif number == TWO:
+                    if number == TWO and kind[g] > 0.0:
                         copy_gap(g, n_listed, place, weight, mean, rows, hints)
                         n_listed += 1
                 for g in range(n_listed, n_listed + 2 * LANES):
@@ -196,7 +214,7 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                         s = int(found[q, 0])
                         settle(
                             record, owner[k], other[p], apart[k, 0], apart[k, 1],
-                            compass[0, s], compass[1, s], found[q, 1], found[q, 2], math.nan,
+                            compass[0, s], compass[1, s], found[q, 1], found[q, 2], found[q, 4],
                             found[q, 3], modes, roots, n_roots,
                         )  # fmt: skip
                         sign[n_roots] = found[q, 3]
@@ -219,6 +237,19 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                         )  # fmt: skip
                         if inner > 0.0:
                             inside[p] = 2
+            for row in range(n_apart):
+                k = pair_of[row]
+                if code[k] == CLOSELY:
+                    continue
+                r = cursor[k]
+                cursor[k] = r + 1
+                s = int(brackets[row, 0])
+                settle(
+                    record, owner[k], listed[k], apart[k, 0], apart[k, 1], compass[0, s],
+                    compass[1, s], brackets[row, 1], brackets[row, 2], brackets[row, 4],
+                    brackets[row, 3], modes, roots, r,
+                )  # fmt: skip
+                sign[r] = brackets[row, 3]
             partner = n_gaps
             for g in range(n_gaps):
                 number = int(peek(kind, g))

@@ -146,6 +146,109 @@ def fourth_derivative(record: Any, i: int, modes: Any) -> float:
     return total
 
 
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
+def margin_of(
+    bend_i: float, bend_j: float, spacing: float, v0: float, v1: float, r0: float, r1: float,
+    mean_j: float,
+) -> float:  # fmt: skip
+    """What the depth may differ by from the cubic through both ends of a gap.
+
+    spacing^4 / 384 times a bound of its fourth derivative: that of i's contour and that of j's, as
+    fast as i passes it. At both ends v is the squared tangent, r the distance to the centre of j.
+    """
+    turning = max(v0, v1) / max(min(r0, r1), 1e-9) ** 2
+    bound = spacing**4 / 384.0 * (bend_i + bend_j * turning * turning)
+    return max(bound, HULL_MARGIN * mean_j)
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
+def halve_gap(
+    record: Any, i: int, j: int, dx: float, dy: float, cosine: float, sine: float,
+    spacing: float, margin: float, modes: Any, stack: Any, found: Any, n_found: int, looks: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Bracket the crossings in a gap, whose ends are in row 0 of `stack`, from row n_found on.
+
+    `looks` are still allowed. Returns the number found in all, and the looks left.
+    """
+    height = 1
+    while height > 0:
+        height -= 1
+        left = stack[height, 0]
+        width = stack[height, 1]
+        a = stack[height, 2]
+        b = stack[height, 3]
+        e = stack[height, 4]
+        f = stack[height, 5]
+        fraction = width / spacing
+        finer = margin * fraction * fraction * fraction * fraction
+        kind = variations(a, b, e, f, width, finer)
+        if kind == 2 and width > 1e-9 and looks > 0:
+            looks -= 1
+            width *= 0.5
+            ca, sa = turn(cosine, sine, left + width)
+            gm, dm, _, _, _, _, _ = gap(record, i, j, dx, dy, ca, sa, modes)
+            # The left half lies on top, so that crossings come in order.
+            stack[height, 0] = left + width
+            stack[height, 1] = width
+            stack[height, 2] = gm
+            stack[height, 3] = b
+            stack[height, 4] = dm
+            stack[height, 5] = f
+            height += 1
+            stack[height, 0] = left
+            stack[height, 1] = width
+            stack[height, 2] = a
+            stack[height, 3] = gm
+            stack[height, 4] = e
+            stack[height, 5] = dm
+            height += 1
+        elif (a > 0.0) != (b > 0.0):
+            if n_found == found.shape[0]:
+                break
+            found[n_found, 1] = left
+            found[n_found, 2] = left + width
+            found[n_found, 3] = 1.0 if a > 0.0 else -1.0
+            found[n_found, 4] = left + width * (a / (a - b))
+            n_found += 1
+    return n_found, looks
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
+def search_gap(
+    record: Any, i: int, j: int, dx: float, dy: float, compass: Any, s: int, begin: float,
+    end: float, modes: Any, stack: Any, found: Any, n_found: int,
+) -> int:  # fmt: skip
+    """Bracket the crossings between one sample and the next as `search_closely` does.
+
+    Returns the number found in all, or -1 where the depth at one end has another sign than
+    `begin` or `end`, its values in single precision, by which the gaps beside are judged.
+    """
+    size = compass.shape[1]
+    spacing = 2.0 * math.pi / size
+    t = (s + 1) % size
+    g0, d0, _, r0, _, _, v0 = gap(record, i, j, dx, dy, compass[0, s], compass[1, s], modes)
+    g1, d1, _, r1, _, _, v1 = gap(record, i, j, dx, dy, compass[0, t], compass[1, t], modes)
+    if (g0 > 0.0) != (begin > 0.0) or (g1 > 0.0) != (end > 0.0):
+        return -1
+    bend_i = fourth_derivative(record, i, modes)
+    bend_j = fourth_derivative(record, j, modes)
+    margin = margin_of(bend_i, bend_j, spacing, v0, v1, r0, r1, record[j, 2])
+    stack[0, 0] = 0.0
+    stack[0, 1] = spacing
+    stack[0, 2] = g0
+    stack[0, 3] = g1
+    stack[0, 4] = d0
+    stack[0, 5] = d1
+    first = n_found
+    n_found, _ = halve_gap(
+        record, i, j, dx, dy, compass[0, s], compass[1, s], spacing, margin, modes, stack, found,
+        n_found, MOST_LOOKS,
+    )  # fmt: skip
+    for row in range(first, n_found):
+        found[row, 0] = s
+    return n_found
+
+
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def search_closely(
     record: Any, i: int, j: int, dx: float, dy: float, compass: Any, start: int, count: int,
@@ -153,19 +256,18 @@ def search_closely(
 ) -> int:  # fmt: skip
     """Bracket the crossings of one pair by halving, in double precision.
 
-    Rows of `found`: number of the sample, bracket as angles from it, and the sign of the depth at
-    its start; without crossings the first row holds the sign everywhere. Returns their number, or
-    -1 where the contours are the same.
+    Rows of `found`: number of the sample, bracket as angles from it, the sign of the depth at its
+    start, and a guess of the crossing; without crossings the first row holds the sign everywhere.
+    Returns their number, or -1 where the contours are the same.
     """
     size = compass.shape[1]
     spacing = 2.0 * math.pi / size
     whole = count > size
-    most = MOST_LOOKS + 8 * count
     mean_j = record[j, 2]
     bend_i = fourth_derivative(record, i, modes)
     bend_j = fourth_derivative(record, j, modes)
     n_found = 0
-    looks = 0
+    looks = MOST_LOOKS + 8 * count
     largest = 0.0
     g1, d1, _, r1, _, _, v1 = gap(record, i, j, dx, dy, compass[0, start], compass[1, start], modes)
     g_first = g1
@@ -186,10 +288,7 @@ def search_closely(
             v1 = v_first
         else:
             g1, d1, _, r1, _, _, v1 = gap(record, i, j, dx, dy, compass[0, t], compass[1, t], modes)
-        # What the depth can differ by from the cubic: spacing^4 / 384 times its fourth derivative.
-        turning = max(v0, v1) / max(min(r0, r1), 1e-9) ** 2
-        margin = spacing**4 / 384.0 * (bend_i + bend_j * turning * turning)
-        margin = max(margin, HULL_MARGIN * mean_j)
+        margin = margin_of(bend_i, bend_j, spacing, v0, v1, r0, r1, mean_j)
         largest = max(largest, abs(g1))
         stack[0, 0] = 0.0
         stack[0, 1] = spacing
@@ -197,46 +296,13 @@ def search_closely(
         stack[0, 3] = g1
         stack[0, 4] = d0
         stack[0, 5] = d1
-        height = 1
-        while height > 0:
-            height -= 1
-            left = stack[height, 0]
-            width = stack[height, 1]
-            a = stack[height, 2]
-            b = stack[height, 3]
-            e = stack[height, 4]
-            f = stack[height, 5]
-            fraction = width / spacing
-            finer = margin * fraction * fraction * fraction * fraction
-            kind = variations(a, b, e, f, width, finer)
-            if kind == 2 and width > 1e-9 and looks < most:
-                looks += 1
-                width *= 0.5
-                ca, sa = turn(compass[0, s], compass[1, s], left + width)
-                gm, dm, _, _, _, _, _ = gap(record, i, j, dx, dy, ca, sa, modes)
-                # The left half lies on top, so that crossings come in order.
-                stack[height, 0] = left + width
-                stack[height, 1] = width
-                stack[height, 2] = gm
-                stack[height, 3] = b
-                stack[height, 4] = dm
-                stack[height, 5] = f
-                height += 1
-                stack[height, 0] = left
-                stack[height, 1] = width
-                stack[height, 2] = a
-                stack[height, 3] = gm
-                stack[height, 4] = e
-                stack[height, 5] = dm
-                height += 1
-            elif (a > 0.0) != (b > 0.0):
-                if n_found == found.shape[0]:
-                    break
-                found[n_found, 0] = s
-                found[n_found, 1] = left
-                found[n_found, 2] = left + width
-                found[n_found, 3] = 1.0 if a > 0.0 else -1.0
-                n_found += 1
+        before = n_found
+        n_found, looks = halve_gap(
+            record, i, j, dx, dy, compass[0, s], compass[1, s], spacing, margin, modes, stack,
+            found, n_found, looks,
+        )  # fmt: skip
+        for row in range(before, n_found):
+            found[row, 0] = s
     if whole and largest < 1e-12 * mean_j:
         return -1
     if n_found == 0:

@@ -20,8 +20,9 @@ from numba import njit
 from cellquant.sim.crossings import ROOT
 from cellquant.sim.records import HEAD
 
-NARROW = 0.3  # radius over R0 below which the contour's length needs more points, and the
-# crossings are sought on this contour: its own radius varies fast with the direction
+NARROW = 0.3  # radius over R0 below which crossings are sought on this contour: its own radius
+# varies fast with the direction
+SHARP = 0.05  # radius over R0 below which the contour's length needs graded panels
 SAMPLES = 128  # of R(phi), between which its zeros are sought
 SHORTEST = 1e-5  # gaps in a contour of a smaller angle are left out
 MOST_ZEROS = 48  # of a contour of 24 modes
@@ -272,9 +273,12 @@ def measure_lengths(record: Any, cells: Any, n_modes: int, tangent: Any) -> None
                     u = share * rho / stretch
                     v = share * slope / stretch
                     tangent[i, 1] += u
+                    c_1 = math.cos(angle)
+                    s_1 = math.sin(angle)
+                    c = c_1
+                    s = s_1
                     for m in range(n_modes):
                         n = m + 2
-                        c = math.cos(n * angle)
-                        s = math.sin(n * angle)
+                        c, s = c * c_1 - s * s_1, s * c_1 + c * s_1
                         tangent[i, 2 + m] += u * c - n * v * s
                         tangent[i, 2 + n_modes + m] += u * s + n * v * c

@@ -31,10 +31,11 @@ from cellquant.sim.lanes import (
 from cellquant.sim.records import HEAD
 
 FINE_MARGIN = 1e-5  # of the interpolation through four samples, single precision included
-WAVE = 5e-3  # amplitude over A0 of what a gap bends by: degree 7 leaves 1.16 bent^2 over it
-ROUGH = 4e-3  # of A0: a gap that bends by more hides what degree 7 cannot see
+BENT = 1e-3  # of A0: of what degree 7 bends the cubic by, it leaves a share of this over it squared
+MISSED = 6.0  # times that may be left where it bends by more
+ROUGH = 1e-2  # of A0: where a gap bends by more, others are not even listed
 STEPS = 3  # of Newton in a gap
-TWO, UNSURE = 2, 3  # crossings in a gap
+TWO, UNSURE, HIDDEN = 2, 3, 4  # crossings in a gap; the last: search the whole pair
 SLACK = 0.05  # of a gap: an extremum just beyond its end counts as within
 BEYOND = 1e-3  # of a gap: how far from it a crossing may be found
 TINY = 1e-30
@@ -138,7 +139,8 @@ def judge_gaps(
         bent = greatest(bent, absolute(q0 + 1.5 * (q1 + 1.5 * (q2 + 1.5 * q3))))
         bent = greatest(bent, absolute(q0 + 2.0 * (q1 + 2.0 * (q2 + 2.0 * q3))))
         bent = bent * (1.0 / 16.0)
-        left = FINE_MARGIN * a0 + bent * bent / (WAVE * a0)
+        share = least(bent / (BENT * a0), 1.0)
+        left = FINE_MARGIN * a0 + MISSED * bent * (share * share)
         margin = choose(inner > 0.0, left, flat)
         # Extrema of the cubic, put on the ends where they lie outside. Conditions are signs.
         square = c2 * c2 - 3.0 * c3 * e0
@@ -162,7 +164,8 @@ def judge_gaps(
         close = either(both(near_1, absolute(p1) - margin), both(near_2, absolute(p2) - margin))
         thrice = both(both(change_1, change_2), change_3)
         unsure = either(either(close, greatest(b1, b2) - flat), thrice)
-        unsure = either(unsure, ROUGH * a0 - bent)
+        ends = least(absolute(g0), absolute(g1)) - margin
+        unsure = either(unsure, ends)
         one, none = singles_pair(1.0), singles_pair(0.0)
         number = pick(change_1, one, none) + pick(change_2, one, none) + pick(change_3, one, none)
         if second:
@@ -172,7 +175,8 @@ def judge_gaps(
             end_of_it = singles_pair(1.0 + BEYOND)
         else:
             # The first piece between extrema that crosses zero, or else the last one.
-            store(kind, g, pick(unsure, singles_pair(UNSURE), number))
+            hidden = pick(ROUGH * a0 - bent, singles_pair(HIDDEN), singles_pair(UNSURE))
+            store(kind, g, pick(either(unsure, ROUGH * a0 - bent), hidden, number))
             low = pick(change_1, none, pick(change_2, t1, t2))
             high = pick(change_1, t1, pick(change_2, t2, one))
             begin_of_it = singles_pair(-BEYOND)

@@ -36,6 +36,7 @@ PAIRS = 112  # pairs whose contours are sampled before the gaps between samples 
 MANY = 12  # gaps of one pair that may hold a crossing; with more it is searched in double precision
 FULL = 4 * PAIRS  # gaps of all of them; pairs for which there is no room are searched in it too
 CLOSELY, OUTSIDE, INSIDE = -1, -2, -3  # what a pair without gaps is
+FAST = 3.0  # turns round the centre of j per turn of i, above which modes of j are undersampled
 END = np.uint64(1 << 63)
 TINY = 1e-30
 
@@ -85,9 +86,11 @@ def find_windows(near: Any, start: Any, count: Any, filled: int, modes: Any) -> 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def sample_pairs(
     grid: Any, rim: Any, pattern: Any, owner: Any, other: Any, near: Any, starts: Any, counts: Any,
-    filled: int, modes: Any, depth: Any, change: Any,
+    filled: int, modes: Any, depth: Any, change: Any, codes: Any,
 ) -> None:  # fmt: skip
     """Sample the depth of i in j for many pairs.
+
+    Where i passes j so fast that the samples lie too far apart, `codes` takes CLOSELY.
 
     Row k of `depth`, and of `change` for its slope times the width of a gap, belongs to pair k and
     holds its first sample in column LANES.
@@ -106,6 +109,7 @@ def sample_pairs(
         row = pair * room + LANES
         x_j = near[pair]
         y_j = near[PAIRS + pair]
+        fastest = singles(0.0)
         for s in range(0, count, LANES):
             rho = load(grid, at + s)
             slope_i = load(grid, at + long + s)
@@ -132,11 +136,14 @@ def sample_pairs(
             zi = 2.0 * ux * uy
             store(depth, row + s, pr * zr + (pattern[j, 0] - pi * zi) - square * inverse)
             qr, qi = qr * ux + (2.0 * pr - qi * uy), qr * uy + (2.0 * pi + qi * ux)
-            slope = (qr * zi + qi * zr) * inverse
             tx = slope_i * c - rho * d
             ty = slope_i * d + rho * c
-            along = slope * (uy * tx - ux * ty) - (ux * tx + uy * ty)
+            passing = (uy * tx - ux * ty) * inverse
+            fastest = greatest(fastest, absolute(passing))
+            along = (qr * zi + qi * zr) * passing - (ux * tx + uy * ty)
             store(change, row + s, width * along)
+        if bits(fastest > FAST) != np.uint64(0):
+            codes[pair] = CLOSELY
         if count > size:
             depth[row - 1] = depth[row + size - 1]
             change[row - 1] = change[row + size - 1]
