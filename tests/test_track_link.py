@@ -20,7 +20,7 @@ from cellquant.segment import measure_cells
 from cellquant.tables import PIXEL, TRACK_COLUMNS, Cells
 from cellquant.track import track_cells
 from cellquant.track.assign import match, match_with_divisions
-from cellquant.track.divisions import _TEMPER, broken_masks, log_frequency, weigh
+from cellquant.track.divisions import broken_masks, log_frequency, weigh
 from cellquant.track.evaluate import evaluate
 from cellquant.track.flow import pair_flow
 from cellquant.track.kernels import marginals
@@ -316,7 +316,7 @@ def test_a_family_is_weighed_against_the_links_it_would_break() -> None:
     odds = np.array([5.5, 2.0])
     nobody = np.empty(0, dtype=np.int64)
     found = weigh(cells, odds, nobody, np.array([0, 1]), np.array([2, 3]), candidates, gain)
-    better = np.exp(_TEMPER * (odds - np.array([5.0, 4.0])))
+    better = np.exp(odds - np.array([5.0, 4.0]))
     np.testing.assert_allclose(found.weight, better / (1.0 + better.sum()))
     taken = weigh(cells, odds, np.array([0]), np.array([1]), np.array([3]), candidates, gain)
     assert taken.chosen.tolist()[0]

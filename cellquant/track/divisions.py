@@ -17,7 +17,6 @@ _RARE = 1e-4
 _PATCH_FRAMES = 3  # for which a mask may be broken
 _PATCHED = 0.25  # of the logarithm of the area, by which a mask that was mended may differ
 _ENOUGH_BROKEN, _BROKEN_SHARE = 10, 0.1  # families that speak for masks that break
-_TEMPER = 0.4  # power of the odds: their terms are not as independent as they pretend
 _COUNTED = 0.02  # chance from which a family counts in a fit
 
 
@@ -109,7 +108,7 @@ def weigh(
     for daughter in (one, two):
         lost = lost + np.where(partner[mother] == daughter, 0.0, into[daughter])
     lost = np.where(chosen, np.maximum(link_one, link_two), lost)
-    better = np.exp(_TEMPER * np.clip(odds - lost, -50.0, 50.0))
+    better = np.exp(np.clip(odds - lost, -50.0, 50.0))
     # Those that were not chosen share the chance of the cells that they have in common.
     rivals = np.where(chosen, 0.0, better)
     shared = np.zeros(len(cells))
