@@ -21,6 +21,7 @@ from cellquant.segment import measure_cells
 from cellquant.tables import Cells, Tracks
 from cellquant.track import track_cells
 from cellquant.track.evaluate import Scores, edges, read_truth, score_tables
+from cellquant.track.link import by_place
 from cellquant.track.movie import flatten
 from cellquant.track.solve import Options, solve
 from layers import data_folder, shuffled, voronoi_layer
@@ -146,6 +147,7 @@ def ablation() -> list[dict]:
     }
     for name, step in SETS:
         cells, labels, truth = load(name, step)
+        cells = by_place(cells)
         movie = flatten(cells)
         solve(movie, Options(), masks=labels)
         for variant, switches in variants.items():

@@ -133,7 +133,7 @@ def track_cells(
             f"none of the {cells.n_frames} frames holds a cell; "
             "check that these are label masks and not the raw movie."
         )
-    cells = _by_place(cells)
+    cells = by_place(cells)
     movie = flatten(cells)
     after = np.full(movie.n_cells, -1, dtype=np.int64)
     second, confidence = after.copy(), np.full(movie.n_cells, np.nan)
@@ -183,7 +183,7 @@ def track_cells(
     )
 
 
-def _by_place(cells: Cells) -> Cells:
+def by_place(cells: Cells) -> Cells:
     """The cells of each frame in the order of their places: no result depends on their labels."""
     table = cells.table
     order = np.lexsort((table["label"], table["x"], table["y"], table["frame"]))
