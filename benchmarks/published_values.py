@@ -144,7 +144,7 @@ def tabulate(rows):
         entry["n_stationary"] = sum(r["stationary"] for r in chosen)
         entry["published"] = PUBLISHED.get(key[2:5], {})
         for name in KEYS:
-            values = np.array([r[name] for r in chosen if r[name] is not None], float)
+            values = np.array([r[name] for r in chosen if r.get(name) is not None], float)
             if len(values):
                 entry[name] = float(values.mean())
             if len(values) > 1:
