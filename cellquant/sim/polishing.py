@@ -32,7 +32,7 @@ from cellquant.sim.records import HEAD
 
 FINE_MARGIN = 1e-5  # of the interpolation through four samples, single precision included
 BENT = 1e-3  # of A0: of what degree 7 bends the cubic by, it leaves a share of this over it squared
-MISSED = 6.0  # times that may be left where it bends by more
+MISSED = 3.0  # times that may be left where it bends by more
 ROUGH = 1e-2  # of A0: where a gap bends by more, others are not even listed
 STEPS = 3  # of Newton in a gap
 TWO, UNSURE, HIDDEN = 2, 3, 4  # crossings in a gap; the last: search the whole pair
