@@ -24,8 +24,10 @@ _COUNTED = 0.02  # chance from which a family counts in a fit
 class Divisions:
     """Log-normal daughters: mean and deviation of each quantity, for M kinds of family.
 
-    The first kind are divisions; the second, where there are enough of them, masks that are broken
-    in two for a few frames. ``separation`` (M, 2) of the logarithm of the daughters' distance over
+    The first kind are divisions of cells that are seen whole; the second divisions at the edge of
+    the view, which cuts the mother or a daughter, so that their sizes and the elongation of those
+    that are cut tell nothing; the third, where there are enough of them, masks that are broken in
+    two for a few frames. ``separation`` (M, 2) of the logarithm of the daughters' distance over
     the root of their summed area; ``ratios`` (M, 4) mean and deviation of the logarithm of their
     summed area over the mother's, deviation of the logarithm of their ratio, and the chance that
     these sizes say more than those of any two cells; ``stretch`` (M, 3, 3) elongation of mother,
@@ -144,7 +146,9 @@ def are_broken(movie: Movie, links: Links, families: Families) -> BoolArray:
     """Whether the masks of the families (F,) fall apart for a while; nobody's where that is rare,
     since a daughter may also be lost by chance."""
     found = broken_masks(movie, links, families.cells) >= 0
-    number, total = float(families.weight[found].sum()), float(families.weight.sum())
+    whole = ~movie.cut[families.cells].any(axis=1)
+    found &= whole
+    number, total = float(families.weight[found].sum()), float(families.weight[whole].sum())
     return found & (number >= max(_ENOUGH_BROKEN, _BROKEN_SHARE * total))
 
 
@@ -166,7 +170,8 @@ def fit_divisions(
     `middle` (N, 2), where they are expected.
     """
     number = float(families.weight[broken].sum())
-    kinds = [~broken, broken] if broken.any() else [~broken]
+    at_edge = movie.cut[families.cells].any(axis=1)
+    kinds = [~broken & ~at_edge, broken] if broken.any() else [~broken & ~at_edge]
     centre = float(np.median(movie.shape[:, LOG_AREA]))
     apart = float(np.log(0.85 * np.median(movie.spacing)) - centre / 2 - 0.15)
     separation, ratios, stretch, widths = [], [], [], []
@@ -179,6 +184,18 @@ def fit_divisions(
         place = (movie.position[one] + movie.position[two]) / 2 - middle[mother]
         square = np.sum(place**2, axis=1) / spread[mother] ** 2
         widths.append(_robust_width(square, weight, 1.5 * width, tail))
+    # Those at the edge are few: drawn towards the others.
+    (mother, one, two), weight = families.cells[at_edge].T, families.weight[at_edge]
+    area = movie.shape[:, LOG_AREA]
+    # The greater of mother and daughters is the lesser part of what is hidden.
+    size = np.maximum(np.logaddexp(area[one], area[two]), area[mother])
+    apart_of = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T)) - size / 2
+    separation.insert(1, np.array(_normal(apart_of, weight, *separation[0], 0.1)))
+    ratios.insert(1, ratios[0])
+    stretch.insert(1, stretch[0])
+    place = (movie.position[one] + movie.position[two]) / 2 - middle[mother]
+    square = np.sum(place**2, axis=1) / spread[mother] ** 2
+    widths.insert(1, _robust_width(square, weight, widths[0], tail))
     return Divisions(
         separation=np.array(separation),
         ratios=np.array(ratios),
@@ -307,8 +324,8 @@ def propose(
     gain = np.empty(len(cells))
     kinds = len(model.width)
     prior = np.empty((kinds, movie.n_cells))
-    prior[0] = log_rate
-    prior[1:] = model.log_broken
+    prior[:2] = log_rate
+    prior[2:] = model.log_broken
     found = division_gains(
         movie.position,
         movie.shape,

@@ -468,11 +468,11 @@ def division_gains(
         first = last
         for c in range(k):
             j = candidates[i, c]
-            if j < 0 or not orphan[j] or cut[j]:
+            if j < 0 or not orphan[j]:
                 continue
             for d in range(k):
                 h = candidates[i, d]
-                if h < 0 or h == j or cut[h] or (orphan[h] and h < j):
+                if h < 0 or h == j or (orphan[h] and h < j):
                     continue
                 dx = position[h, 0] - position[j, 0]
                 dy = position[h, 1] - position[j, 1]
@@ -485,12 +485,16 @@ def division_gains(
                 # Elongation along and across the line between the daughters.
                 along = (dx * dx - dy * dy) / (apart * apart)
                 across = 2.0 * dx * dy / (apart * apart)
+                at_edge = cut[i] or cut[j] or cut[h]
+                size = max(both, shape[i, 0]) if at_edge else both
                 value = -np.inf
                 for m in range(len(prior)):
+                    if at_edge != (m == 1):
+                        continue
                     w = width[m, i]
                     one = prior[m, i] - np.log(2 * np.pi * w * w)
                     one -= (tail / 2 + 1) * np.log1p((mx * mx + my * my) / (w * w * tail))
-                    z = (np.log(apart) - both / 2 - separation[m, 0]) / separation[m, 1]
+                    z = (np.log(apart) - size / 2 - separation[m, 0]) / separation[m, 1]
                     one -= 0.5 * z * z + np.log(separation[m, 1] * np.sqrt(2 * np.pi))
                     r = ratios[m]
                     z = (both - shape[i, 0] - r[0]) / r[1]
@@ -498,8 +502,11 @@ def division_gains(
                     z = (shape[j, 0] - shape[h, 0]) / r[2]
                     sizes -= 0.5 * z * z
                     sizes -= population[j] + population[h]
-                    one += np.log(1.0 - r[3] + r[3] * np.exp(sizes))
+                    if not at_edge:
+                        one += np.log(1.0 - r[3] + r[3] * np.exp(sizes))
                     for g, role in ((i, 0), (j, 1), (h, 1)):
+                        if cut[g]:
+                            continue
                         law, any_cell = stretch[m, role], stretch[m, 2, 1]
                         e = along * shape[g, 1] + across * shape[g, 2]
                         o = along * shape[g, 2] - across * shape[g, 1]
@@ -507,7 +514,7 @@ def division_gains(
                         far = (e * e + o * o) / any_cell**2
                         one += (nu / 2 + 1) * (np.log1p(far / nu) - np.log1p(near / nu))
                         one += np.log(any_cell**2 / (law[1] * law[2]))
-                    value = one if m == 0 else np.logaddexp(value, one)
+                    value = one if m < 2 else np.logaddexp(value, one)
                 value -= np.log(2 * np.pi * apart * apart)
                 value -= leave[i] + appear[j] + appear[h]
                 if value <= least or (last - first == most and value <= out_gain[last - 1]):

@@ -178,7 +178,7 @@ def solve(
         turn += 1
         if progress is not None:
             progress(frames * (turn - first + 1) // total, frames)
-    if state.links is not None and state.divisions is not None and len(state.divisions.width) > 1:
+    if state.links is not None and state.divisions is not None and len(state.divisions.width) > 2:
         state.links = _mended(movie, state.links)
     if progress is not None:
         progress(frames, frames)
@@ -324,7 +324,11 @@ def _families(
     )
     if images is None or len(gain) == 0:
         return cells, gain, []
-    looks = images.families(cells)
+    whole = ~state.movie.cut[cells].any(axis=1)
+    looks = [
+        Look(np.where(whole, look.value, np.nan), look.context, look.distance)
+        for look in images.families(cells)
+    ]
     return cells, gain + evidence(state.family_cues, looks), looks
 
 
