@@ -17,6 +17,8 @@ _RARE = 1e-4
 _PATCH_FRAMES = 3  # for which a mask may be broken
 _PATCHED = 0.25  # of the logarithm of the area, by which a mask that was mended may differ
 _ENOUGH_BROKEN, _BROKEN_SHARE = 10, 0.1  # families that speak for masks that break
+_INFORMATIVE = 0.5  # first guess of the chance that sizes tell a family
+_AT_EDGE = 2.0  # times wider that sizes scatter at the edge of the view, at first
 _COUNTED = 0.02  # chance from which a family counts in a fit
 
 
@@ -171,68 +173,85 @@ def fit_divisions(
     """
     number = float(families.weight[broken].sum())
     at_edge = movie.cut[families.cells].any(axis=1)
-    kinds = [~broken & ~at_edge, broken] if broken.any() else [~broken & ~at_edge]
     centre = float(np.median(movie.shape[:, LOG_AREA]))
     apart = float(np.log(0.85 * np.median(movie.spacing)) - centre / 2 - 0.15)
-    separation, ratios, stretch, widths = [], [], [], []
-    for kind in kinds:
-        (mother, one, two), weight = families.cells[kind].T, families.weight[kind]
-        found = _fit_kind(movie, mother, one, two, weight, apart, population)
-        separation.append(found[0])
-        ratios.append(found[1])
-        stretch.append(_fit_stretch(movie, mother, one, two, weight))
-        place = (movie.position[one] + movie.position[two]) / 2 - middle[mother]
-        square = np.sum(place**2, axis=1) / spread[mother] ** 2
-        widths.append(_robust_width(square, weight, 1.5 * width, tail))
-    # Those at the edge are few: drawn towards the others.
-    (mother, one, two), weight = families.cells[at_edge].T, families.weight[at_edge]
-    area = movie.shape[:, LOG_AREA]
-    # The greater of mother and daughters is the lesser part of what is hidden.
-    size = np.maximum(np.logaddexp(area[one], area[two]), area[mother])
-    apart_of = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T)) - size / 2
-    separation.insert(1, np.array(_normal(apart_of, weight, *separation[0], 0.1)))
-    ratios.insert(1, ratios[0])
-    stretch.insert(1, stretch[0])
-    place = (movie.position[one] + movie.position[two]) / 2 - middle[mother]
-    square = np.sum(place**2, axis=1) / spread[mother] ** 2
-    widths.insert(1, _robust_width(square, weight, widths[0], tail))
+
+    def fit(kind: BoolArray, prior: _Kind) -> _Kind:
+        return _fit_kind(movie, families[kind], middle, population, spread, tail, prior)
+
+    general = _Kind((apart, 0.3), (0.3, 0.35), 0.3, _INFORMATIVE, 1.5 * width)
+    whole = fit(~broken & ~at_edge, general)
+    # Those at the edge are few, and what is seen of them is like the others, but scatters more.
+    wider = _Kind(
+        (whole.separation[0], whole.separation[1]),
+        (whole.total[0], _AT_EDGE * whole.total[1]),
+        _AT_EDGE * whole.uneven,
+        _INFORMATIVE,
+        whole.width,
+    )
+    kinds = [whole, fit(at_edge, wider)]
+    stretch = [_fit_stretch(movie, families[~broken & ~at_edge])] * 2
+    if broken.any():
+        kinds.append(fit(broken, general))
+        stretch.append(_fit_stretch(movie, families[broken]))
     return Divisions(
-        separation=np.array(separation),
-        ratios=np.array(ratios),
+        separation=np.array([kind.separation for kind in kinds]),
+        ratios=np.array([(*kind.total, kind.uneven, kind.informative) for kind in kinds]),
         stretch=np.array(stretch),
-        width=np.array(widths),
+        width=np.array([kind.width for kind in kinds]),
         population=population,
         log_broken=float(np.log((number + 0.5) / (movie.n_cells + 1.0))),
     )
 
 
+@dataclass(frozen=True)
+class _Kind:
+    """Laws of one kind of family; `Divisions` holds those of all."""
+
+    separation: tuple[float, float]
+    total: tuple[float, float]
+    uneven: float
+    informative: float
+    width: float
+
+
 def _fit_kind(
     movie: Movie,
-    mother: IntArray,
-    one: IntArray,
-    two: IntArray,
-    weight: FloatArray,
-    usual: float,
+    families: Families,
+    middle: FloatArray,
     population: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Separation (2,) and ratios (4,) of one kind of family; `usual` is their prior distance."""
+    spread: FloatArray,
+    tail: float,
+    prior: _Kind,
+) -> _Kind:
+    (mother, one, two), weight = families.cells.T, families.weight
     area = movie.shape[:, LOG_AREA]
     both = np.logaddexp(area[one], area[two])
-    apart = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T)) - both / 2
+    cut = movie.cut[families.cells].any(axis=1)
+    # Where the edge hides a part, the greater of mother and daughters says most of their size.
+    size = np.where(cut, np.maximum(both, area[mother]), both)
+    apart = np.log(np.hypot(*(movie.position[one] - movie.position[two]).T)) - size / 2
     total = both - area[mother]
     ratio = area[one] - area[two]
-    total_fit = _normal(total, weight, 0.3, 0.35, 0.1)
-    uneven = _normal(ratio, weight, 0.0, 0.3, 0.1, fixed=True)[1]
+    total_fit = _normal(total, weight, *prior.total, 0.1)
+    uneven = _normal(ratio, weight, 0.0, prior.uneven, 0.1, fixed=True)[1]
     # How often the sizes of daughters are told better by these laws than by the population.
     family = _log_normal(total, *total_fit) + _log_normal(ratio, 0.0, uneven)
     family -= population[one] + population[two]
     ratio_of = np.exp(np.clip(family, -50.0, 50.0))
-    informative = 0.5
+    informative = prior.informative
     for _ in range(20):
         share = informative * ratio_of / (informative * ratio_of + 1.0 - informative)
         informative = (float(weight @ share) + 1.0) / (float(weight.sum()) + 2.0)
-    separation = _normal(apart, weight, usual, 0.3, 0.1)
-    return np.array(separation), np.array([*total_fit, uneven, informative])
+    place = (movie.position[one] + movie.position[two]) / 2 - middle[mother]
+    square = np.sum(place**2, axis=1) / spread[mother] ** 2
+    return _Kind(
+        _normal(apart, weight, *prior.separation, 0.1),
+        total_fit,
+        uneven,
+        informative,
+        _robust_width(square, weight, prior.width, tail),
+    )
 
 
 def _robust_width(square: FloatArray, each: FloatArray, prior: float, tail: float) -> float:
@@ -245,9 +264,8 @@ def _robust_width(square: FloatArray, each: FloatArray, prior: float, tail: floa
     return width
 
 
-def _fit_stretch(
-    movie: Movie, mother: IntArray, one: IntArray, two: IntArray, weight: FloatArray
-) -> FloatArray:
+def _fit_stretch(movie: Movie, families: Families) -> FloatArray:
+    (mother, one, two), weight = families.cells.T, families.weight
     elongation = movie.shape[:, 1:3]
     width = max(float(np.sqrt(np.mean(elongation**2))), _STRETCH_FLOOR)
     line = movie.position[two] - movie.position[one]
@@ -279,7 +297,18 @@ def _normal(
     return centre, max(float(np.sqrt((square + _PRIOR_DIVISIONS * deviation**2) / n)), floor)
 
 
-def log_frequency(values: FloatArray) -> FloatArray:
+def size_frequencies(movie: Movie) -> FloatArray:
+    """Log density (N,) of the logarithm of each cell's area, among the cells that the edge cuts
+    and among the others."""
+    area = movie.shape[:, LOG_AREA]
+    found = np.empty(movie.n_cells)
+    for kind in (movie.cut, ~movie.cut):
+        if kind.any():
+            found[kind] = _log_frequency(area[kind])
+    return found
+
+
+def _log_frequency(values: FloatArray) -> FloatArray:
     """Log density (N,) of each value among all of them.
 
     Counted, not assumed normal: a merged or broken cell is as rare as there are such cells, and

@@ -502,8 +502,7 @@ def division_gains(
                     z = (shape[j, 0] - shape[h, 0]) / r[2]
                     sizes -= 0.5 * z * z
                     sizes -= population[j] + population[h]
-                    if not at_edge:
-                        one += np.log(1.0 - r[3] + r[3] * np.exp(sizes))
+                    one += np.log(1.0 - r[3] + r[3] * np.exp(sizes))
                     for g, role in ((i, 0), (j, 1), (h, 1)):
                         if cut[g]:
                             continue

@@ -23,16 +23,16 @@ from cellquant.track.divisions import (
     are_broken,
     broken_masks,
     fit_divisions,
-    log_frequency,
     no_families,
     propose,
+    size_frequencies,
     weigh,
 )
 from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
 from cellquant.track.flow import CANDIDATES, all_flows
 from cellquant.track.images import PairImages
 from cellquant.track.kernels import marginals
-from cellquant.track.movie import LOG_AREA, BoolArray, FloatArray, IntArray, Links, Movie
+from cellquant.track.movie import BoolArray, FloatArray, IntArray, Links, Movie
 from cellquant.track.near import nearest_cells
 from cellquant.track.shapes import Shapes, fit_shapes, population_of
 
@@ -217,7 +217,7 @@ def _start(movie: Movie, options: Options) -> Solution:
         motion=first_motion(movie, flow, candidates),
         shapes=fit_shapes(movie, None, population_of(movie)),
         rates=fit_rates(movie, None, nobody, nobody, leaving, entering),
-        sizes=log_frequency(movie.shape[:, LOG_AREA]),
+        sizes=size_frequencies(movie),
     )
 
 
