@@ -6,11 +6,11 @@ import numpy as np
 
 from cellquant.track.movie import LOG_AREA, BoolArray, FloatArray, IntArray, Links, Movie
 
-PLACES = 3  # inside the layer, at the edge of the view, at the rim of the layer
-INSIDE, EDGE, RIM = range(PLACES)
+PLACES = 4  # inside the layer, near the edge of the view, cut by it, at the rim of the layer
+INSIDE, EDGE, CUT, RIM = range(PLACES)
 _PRIOR_EVENTS = 2.0
 _PRIOR_RATE = 0.01
-_FIRST_RATE = (0.02, 0.2, 0.02)
+_FIRST_RATE = (0.02, 0.2, 0.2, 0.02)
 _FIRST_DIVISIONS = 0.005
 _UNBORN = 0.2
 _MOST = 0.5
@@ -24,7 +24,7 @@ _SIZE_LIMITS = (np.exp(-3.0), np.exp(3.0))
 class Rates:
     """Chance per cell and frame pair to vanish, to appear, to divide.
 
-    ``vanish``, ``appear`` (P, 3) by frame and place; ``divide`` (P,). Entries of a frame belong
+    ``vanish``, ``appear`` (P, 4) by frame and place; ``divide`` (P,). Entries of a frame belong
     to the step that leaves it, those of ``appear`` to the step that enters it.
     """
 
@@ -61,7 +61,12 @@ def places(movie: Movie, flow: FloatArray) -> tuple[IntArray, IntArray]:
         return near
 
     inside = np.where(movie.rim, RIM, INSIDE)
-    return np.where(at_edge(ahead), EDGE, inside), np.where(at_edge(back), EDGE, inside)
+
+    def place(point: FloatArray) -> IntArray:
+        found: IntArray = np.where(movie.cut, CUT, np.where(at_edge(point), EDGE, inside))
+        return found
+
+    return place(ahead), place(back)
 
 
 def fit_rates(
@@ -139,18 +144,21 @@ def fates(
     if links is not None:
         size = movie.shape[:, LOG_AREA]
         cell, last, first = np.arange(movie.n_cells), movie.start[-2], movie.start[1]
-        # Cells cut by the edge have no size of their own.
-        whole = ~movie.cut
-        gone = (cell < last) & (links.after < 0) & whole
-        split = (cell < last) & (links.second >= 0) & whole
-        new = (cell >= first) & (links.before < 0) & whole
-        usual = _size_law(size[(cell < last) & whole & ~gone & ~split], None)
-        vanish = vanish * np.where(whole, _size_ratio(size, size[gone], usual), 1.0)
-        divide = divide * np.where(whole, _size_ratio(size, size[split], usual), 1.0)
+        gone = (cell < last) & (links.after < 0)
+        split = (cell < last) & (links.second >= 0)
+        new = (cell >= first) & (links.before < 0)
+        # What is seen of cells that the edge cuts is compared among them.
+        for kind in (movie.cut, ~movie.cut):
+            if not kind.any():
+                continue
+            usual = _size_law(size[(cell < last) & kind & ~gone & ~split], None)
+            vanish[kind] *= _size_ratio(size[kind], size[gone & kind], usual)
+            appear[kind] *= _size_ratio(size[kind], size[new & kind], usual)
+            if kind is not movie.cut:
+                divide[kind] *= _size_ratio(size[kind], size[split & kind], usual)
         total = stay + vanish + divide
         stay, vanish, divide = stay / total, vanish / total, divide / total
-        seen = np.where(whole, _size_ratio(size, size[new], usual), 1.0)
-        appear = np.minimum(appear * seen, _MOST)
+        appear = np.minimum(appear, _MOST)
     return Fates(
         np.log(np.maximum(stay, 1e-6)),
         np.log(np.maximum(vanish, 1e-9)),
