@@ -20,7 +20,7 @@ from cellquant.segment import measure_cells
 from cellquant.tables import PIXEL, TRACK_COLUMNS, Cells
 from cellquant.track import track_cells
 from cellquant.track.assign import match, match_with_divisions
-from cellquant.track.divisions import broken_masks, log_frequency, weigh
+from cellquant.track.divisions import _log_frequency, broken_masks, weigh
 from cellquant.track.evaluate import evaluate
 from cellquant.track.flow import pair_flow
 from cellquant.track.kernels import marginals
@@ -132,6 +132,12 @@ def test_divisions_are_found_and_can_be_switched_off() -> None:
     assert tracks.provenance["divisions"] == 8
     families = tracks.table[tracks.table["parent_track_id"] > 0].groupby("parent_track_id")
     assert (families["track_id"].nunique() == 2).all()
+    # One daughter of some is cut by the edge of the view.
+    some = np.sum(start[mothers, 0] == start[:, 0].min())
+    cropped = array[:, :, 16:]
+    assert some > 0
+    assert len(np.unique(cropped[-1, :, 0])) > some
+    assert cq.track(stack_of(cropped)).provenance["divisions"] == 8
     without = cq.track(stack_of(array), divisions=False)
     assert (without.table["parent_track_id"] == 0).all()
 
@@ -285,7 +291,7 @@ def test_rare_sizes_are_as_rare_as_they_occur() -> None:
     """A handful of merged cells must not look impossible, or anything would explain them better."""
     sizes = np.random.default_rng(0).normal(scale=0.1, size=2000)
     sizes[:20] += np.log(2.0)
-    log_density = log_frequency(sizes)
+    log_density = _log_frequency(sizes)
     normal = -0.5 * (sizes / 0.1) ** 2 - np.log(0.1 * np.sqrt(2 * np.pi))
     assert np.median(normal[:20]) < -15.0
     assert (log_density[:20] > -7.0).all()

@@ -1,6 +1,6 @@
 """Divisions: one mother, two daughters, judged by place, distance and sizes; and broken masks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -18,7 +18,6 @@ _PATCH_FRAMES = 3  # for which a mask may be broken
 _PATCHED = 0.25  # of the logarithm of the area, by which a mask that was mended may differ
 _ENOUGH_BROKEN, _BROKEN_SHARE = 10, 0.1  # families that speak for masks that break
 _INFORMATIVE = 0.5  # first guess of the chance that sizes tell a family
-_AT_EDGE = 2.0  # times wider that sizes scatter at the edge of the view, at first
 _COUNTED = 0.02  # chance from which a family counts in a fit
 
 
@@ -172,7 +171,7 @@ def fit_divisions(
     `middle` (N, 2), where they are expected.
     """
     number = float(families.weight[broken].sum())
-    at_edge = movie.cut[families.cells].any(axis=1)
+    at_edge: BoolArray = np.asarray(movie.cut[families.cells].any(axis=1))
     centre = float(np.median(movie.shape[:, LOG_AREA]))
     apart = float(np.log(0.85 * np.median(movie.spacing)) - centre / 2 - 0.15)
 
@@ -181,15 +180,9 @@ def fit_divisions(
 
     general = _Kind((apart, 0.3), (0.3, 0.35), 0.3, _INFORMATIVE, 1.5 * width)
     whole = fit(~broken & ~at_edge, general)
-    # Those at the edge are few, and what is seen of them is like the others, but scatters more.
-    wider = _Kind(
-        (whole.separation[0], whole.separation[1]),
-        (whole.total[0], _AT_EDGE * whole.total[1]),
-        _AT_EDGE * whole.uneven,
-        _INFORMATIVE,
-        whole.width,
-    )
-    kinds = [whole, fit(at_edge, wider)]
+    # Those at the edge are few, and much of what is seen of them is like the others.
+    seen = replace(whole, informative=_INFORMATIVE)
+    kinds = [whole, fit(at_edge, seen)]
     stretch = [_fit_stretch(movie, families[~broken & ~at_edge])] * 2
     if broken.any():
         kinds.append(fit(broken, general))

@@ -303,8 +303,9 @@ def _compare(state: Solution, images: PairImages) -> tuple[IntArray, list[Look]]
 
 def _families(
     state: Solution, orphan: BoolArray, middle: FloatArray, images: PairImages | None
-) -> tuple[IntArray, FloatArray, list[Look]]:
-    """Divisions worth considering, their log odds, and how the images of them look."""
+) -> tuple[IntArray, FloatArray, BoolArray, list[Look]]:
+    """Divisions worth considering, their log odds, which are seen whole, and how the images of
+    those look."""
     assert state.divisions is not None
     assert state.fates is not None
     assert state.gain is not None
@@ -322,14 +323,13 @@ def _families(
         state.fates.vanish,
         state.fates.appear,
     )
-    if images is None or len(gain) == 0:
-        return cells, gain, []
-    whole = ~state.movie.cut[cells].any(axis=1)
-    looks = [
-        Look(np.where(whole, look.value, np.nan), look.context, look.distance)
-        for look in images.families(cells)
-    ]
-    return cells, gain + evidence(state.family_cues, looks), looks
+    # What the edge cuts off is not known of masks either.
+    whole: BoolArray = np.asarray(~state.movie.cut[cells].any(axis=1))
+    if images is None or not whole.any():
+        return cells, gain, whole, []
+    looks = images.families(cells[whole])
+    gain[whole] += evidence(state.family_cues, looks)
+    return cells, gain, whole, looks
 
 
 def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> Links:
@@ -349,16 +349,18 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
     row, slot = np.nonzero(probability > _UNLIKELY)
     column, sure = candidates[row, slot], probability[row, slot]
     families, odds = np.empty((0, 3), dtype=np.int64), np.empty(0)
+    whole = np.empty(0, dtype=np.bool_)
     looks: list[Look] = []
     if state.divisions is not None:
         reached = np.zeros(n)
         np.maximum.at(reached, column, sure)
-        families, odds, looks = _families(state, reached < _SURE, middle, images)
+        families, odds, whole, looks = _families(state, reached < _SURE, middle, images)
     chosen, split = match_with_divisions(row, column, gain[row, slot], families, odds)
     state.families = weigh(families, odds, split, row[chosen], column[chosen], candidates, gain)
     if looks:
         taken = np.zeros(len(odds), dtype=bool)
         taken[split] = True
+        taken = taken[whole]
         state.family_cues = [fit_cue(look, taken, ~taken) for look in looks]
     after = np.full(n, -1, dtype=np.int64)
     second, before = after.copy(), after.copy()
