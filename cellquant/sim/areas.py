@@ -18,7 +18,15 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from cellquant.sim.pinches import MOST_ZEROS, NODES, WEIGHTS, gaps, radius_towards
+from cellquant.sim.pinches import (
+    MOST_PANELS,
+    MOST_ZEROS,
+    NODES,
+    WEIGHTS,
+    gaps,
+    graded_panels,
+    radius_towards,
+)
 from cellquant.sim.records import HEAD
 
 ROUND_OFF = 1e-15  # of A0 over R0
@@ -145,45 +153,32 @@ def correct_velocity(
 
 @njit(cache=True, error_model="numpy")
 def measure_lobes(record: Any, i: int, n_modes: int, ends: Any, n_ends: int, out: Any) -> None:
-    """Add what `measure` finds, on panels between the gaps halved as in `measure_lengths`."""
-    stack = np.empty((64, 2))
+    """Add what `measure` finds, on graded panels between the gaps."""
+    panels = np.empty((MOST_PANELS, 2))
     bend = abs(record[i, 2])
     for m in range(n_modes):
         bend += (m + 3.0) ** 2 * math.hypot(record[i, HEAD + m], record[i, HEAD + n_modes + m])
     for e in range(1, n_ends, 2):
-        begin = ends[e]
-        whole = (ends[(e + 1) % n_ends] - begin) % (2.0 * math.pi)
+        whole = (ends[(e + 1) % n_ends] - ends[e]) % (2.0 * math.pi)
         n_panels = math.ceil(whole * 8.0 / math.pi)
-        for panel in range(n_panels):
-            stack[0, 0] = begin + panel * whole / n_panels
-            stack[0, 1] = whole / n_panels
-            height = 1
-            while height > 0:
-                height -= 1
-                low = stack[height, 0]
-                width = stack[height, 1]
-                rho, slope = radius_towards(record, i, low + 0.5 * width, n_modes)
-                if math.hypot(rho, slope) < bend * width and width > 1e-9:
-                    stack[height, 0] = low
-                    stack[height, 1] = 0.5 * width
-                    stack[height + 1, 0] = low + 0.5 * width
-                    stack[height + 1, 1] = 0.5 * width
-                    height += 2
-                    continue
-                for g in range(NODES.shape[0]):
-                    angle = low + 0.5 * width * (1.0 + NODES[g])
-                    share = 0.5 * width * WEIGHTS[g]
-                    rho, slope = radius_towards(record, i, angle, n_modes)
-                    x = math.cos(angle)
-                    y = math.sin(angle)
-                    out[0] += share * math.hypot(rho, slope)
-                    second = share * rho * rho
-                    out[1] += 0.5 * second
-                    out[2] += second * rho * x / 3.0
-                    out[3] += second * rho * y / 3.0
-                    out[4] += 0.25 * second * rho * rho * x * x
-                    out[5] += 0.25 * second * rho * rho * x * y
-                    out[6] += 0.25 * second * rho * rho * y * y
+        count = graded_panels(record, i, ends[e], whole, n_panels, bend, n_modes, panels)
+        for panel in range(count):
+            low = panels[panel, 0]
+            width = panels[panel, 1]
+            for g in range(NODES.shape[0]):
+                angle = low + 0.5 * width * (1.0 + NODES[g])
+                share = 0.5 * width * WEIGHTS[g]
+                rho, slope = radius_towards(record, i, angle, n_modes)
+                x = math.cos(angle)
+                y = math.sin(angle)
+                out[0] += share * math.hypot(rho, slope)
+                second = share * rho * rho
+                out[1] += 0.5 * second
+                out[2] += second * rho * x / 3.0
+                out[3] += second * rho * y / 3.0
+                out[4] += 0.25 * second * rho * rho * x * x
+                out[5] += 0.25 * second * rho * rho * x * y
+                out[6] += 0.25 * second * rho * rho * y * y
 
 
 @njit(cache=True, error_model="numpy")

@@ -12,7 +12,9 @@ from cellquant.sim import (
     areas,
     crossings,
     discs,
+    energies,
     lanes,
+    lenses,
     neighbours,
     outlines,
     overlaps,
@@ -136,7 +138,7 @@ class Layer:
         if self.scene.rigid:
             self._share(
                 discs.rigid_velocity,
-                (state, self.radius, *common, *back, self._numbers, out, self._energy),
+                (state, self.radius, *common, *back, self._numbers, out),
             )
         elif self.contact == "exact":
             self._find_crossings()
@@ -144,7 +146,7 @@ class Layer:
                 overlaps.exact_velocity,
                 (
                     state, self.radius, self._record, self._tangent, self._first, self._other,
-                    *back, self._roots, self._root_first, self._root_last, self._sign,
+                    *back, self._roots, self._root_first, self._root_last, self._lenses,
                     self._inside, self._numbers, out, self._energy, self._growth,
                 ),
                 self._modes,
@@ -173,7 +175,15 @@ class Layer:
         if self.contact != "exact":
             raise ValueError("energies belong to the exact contact rule")
         self.velocity(state, np.empty_like(state))
-        return self._energy.copy()
+        if self.scene.rigid:
+            shared = energies.disc_overlaps(
+                state, self.radius, self._first, self._other, self._shift
+            )
+            return self.scene.k * shared + 2.0 * math.pi * self.scene.eta * self.radius
+        areas_of_lenses = energies.lens_areas(
+            self._roots, self._root_first, self._root_last, self._first
+        )
+        return self._energy + self.scene.k * areas_of_lenses
 
     def touching(self, state: Floats) -> NDArray[np.int64]:
         """Pairs (i, j) of cells that overlap by the exact rule, (pairs, 2), one row per image."""
@@ -315,6 +325,7 @@ class Layer:
         self._root_first = np.zeros(len(self._other), np.int64)
         self._root_last = np.zeros(len(self._other), np.int64)
         self._inside = np.zeros(len(self._other), np.int8)
+        self._lenses = lanes.zeros(len(self._other), lenses.LENS)
         self._reference = np.ascontiguousarray(self._record[:, [0, 1, 3, 4]])
         self.builds += 1
 
@@ -335,28 +346,27 @@ class Layer:
 
     def _allocate_roots(self, room: int, spare: int = 0) -> None:
         self._room = self._n_blocks * room
-        self._roots = lanes.zeros(self._room + spare, crossings.ROOT)
-        self._sign = np.zeros(self._room + spare)
-        self._of_blocks = self._roots[: self._room], self._sign[: self._room]
+        # The last row stays zero: no crossing.
+        self._roots = lanes.zeros(self._room + spare + 1, lenses.ROOT)
         self._fault = np.zeros(self._n_blocks, np.int64)
 
     def _find_crossings(self) -> None:
         while True:
-            roots, sign = self._of_blocks
             if len(self._work[0]) < self._n_parts:
                 self._work = crossings.work(self._n_parts, self._table.shape[1])
             self._share(
                 crossings.crossings,
                 (
                     self._record, self._grid, self._rim, self._pattern, self._circle,
-                    self._table, self._first, self._other, self._shift, roots, self._root_first,
-                    self._root_last, sign, self._inside, self._fault, *self._work,
+                    self._table, self._first, self._other, self._shift, self._roots[: self._room],
+                    self._root_first, self._root_last, self._lenses, self._inside, self._fault,
+                    *self._work,
                 ),
                 self._modes,
             )  # fmt: skip
             if self._fault.any():
                 self._allocate_roots(2 * self._room // self._n_blocks)
-            elif (used := self._close_pinches()) > len(self._roots):
+            elif (used := self._close_pinches()) >= len(self._roots):
                 self._allocate_roots(self._room // self._n_blocks, 2 * (used - self._room))
             else:
                 return
@@ -374,10 +384,10 @@ class Layer:
                 pinched,
                 self._first,
                 self._other,
-                self._roots,
+                self._roots[:-1],
                 self._root_first,
                 self._root_last,
-                self._sign,
+                self._lenses,
                 self._inside,
                 self._room,
                 len(self._modes),

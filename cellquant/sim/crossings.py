@@ -17,12 +17,8 @@ import numpy as np
 from numba import njit
 
 from cellquant.sim.grazes import FLAGS, gap, search_closely, search_gap, settle
-from cellquant.sim.lanes import (
-    LANES,
-    peek,
-    poke,
-    zeros,
-)
+from cellquant.sim.lanes import LANES, peek, poke, zeros
+from cellquant.sim.lenses import LENS, ROOT, sum_lens, sum_lenses
 from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import shared
 from cellquant.sim.polishing import TWO, UNSURE, judge_gaps, polish
@@ -37,7 +33,6 @@ from cellquant.sim.sampling import (
     sample_pairs,
 )
 
-ROOT = 8  # columns of a root: unit vectors on i and on j, rho on i and on j, error, angle
 LISTED = 4 * FULL + 4 * LANES  # gaps, second crossings, and what to polish again
 NARROW = 0.1  # smallest radius over A0 for which single precision is trusted
 MOST_OF_A_GAP = 64  # crossings, where it is searched in double precision
@@ -51,7 +46,7 @@ def work(n_parts: int, size: int) -> tuple[Any, ...]:
         zeros(n_parts, 4, LISTED, kind=np.int64),
         zeros(n_parts, 2, LISTED, kind=np.int64),
         zeros(n_parts, 3, LISTED, kind=np.float32),
-        zeros(n_parts, 4, LISTED, kind=np.float32),
+        zeros(n_parts, 5, LISTED, kind=np.float32),
         zeros(n_parts, 13, LISTED, kind=np.float32),
         zeros(n_parts, 13, LISTED),
         zeros(n_parts, 2, PAIRS * (size + 5 * LANES), kind=np.float32),
@@ -68,6 +63,7 @@ def copy_gap(
     mean[to] = mean[source]
     for row in range(4):
         rows[row, to] = rows[row, source]
+    for row in range(5):
         hints[row, to] = hints[row, source]
 
 
@@ -76,12 +72,13 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
     """Find where the contours of every listed pair cross.
 
     `roots` has the same room for every block of cells; the crossings of pair p are the rows
-    root_first[p] to root_last[p]. `inside` is 1 where i lies in j, 2 where j lies in i. Every part
-    has its own work arrays (see `work`).
+    root_first[p] to root_last[p], and `lenses` takes their sums (see there). `inside` is 1 where i
+    lies in j, 2 where j lies in i. Every part has its own work arrays (see `work`).
     """
     (
         record, grid, rim, pattern, circle, compass, first, other, shift, roots, root_first,
-        root_last, sign, inside, fault, gaps, places, weights, hints_of, pieces, lines_of, samples,
+        root_last, lenses, inside, fault, gaps, places, weights, hints_of, pieces, lines_of,
+        samples,
     ) = arrays  # fmt: skip
     n_cells = record.shape[0]
     stride = record.shape[1]
@@ -217,7 +214,6 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                             compass[0, s], compass[1, s], found[q, 1], found[q, 2], found[q, 4],
                             found[q, 3], modes, roots, n_roots,
                         )  # fmt: skip
-                        sign[n_roots] = found[q, 3]
                         n_roots += 1
                 elif n_roots + total[k] > full:
                     fault[block] = OVERFLOW
@@ -249,7 +245,6 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                     compass[1, s], brackets[row, 1], brackets[row, 2], brackets[row, 4],
                     brackets[row, 3], modes, roots, r,
                 )  # fmt: skip
-                sign[r] = brackets[row, 3]
             partner = n_gaps
             for g in range(n_gaps):
                 number = int(peek(kind, g))
@@ -257,14 +252,9 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                 dead = (peek(code, k) == CLOSELY) | (number == 0)
                 r = peek(cursor, k)
                 poke(cursor, k, r + number)
-                r = dump if dead else r
-                value = math.copysign(1.0, peek(depth, peek(place, g)))
-                poke(target, g, ROOT * r)
-                poke(sign, r, value)
+                poke(target, g, ROOT * (dump if dead else r))
                 if number == TWO:
-                    r = dump if dead else r + 1
-                    target[partner] = ROOT * r
-                    sign[r] = -value
+                    poke(target, partner, ROOT * (dump if dead else r + 1))
                     partner += 1
             # What one step does not settle takes a second one, then safeguarded ones.
             again = n_listed
@@ -283,7 +273,7 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                     if not peek(lines, g) < SETTLED and target[g] != ROOT * dump:
                         copy_gap(g, again, place, weight, mean, rows, hints)
                         target[again] = target[g]
-                        moved = roots[target[g] // ROOT, 7]
+                        moved = lines[1, g]
                         if hints[2, g] < moved < hints[3, g]:
                             hints[0, again] = moved
                         again += 1
@@ -295,6 +285,25 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                 s = rows[0, g] // 4
                 settle(
                     record, owner[k], other[begin + k], apart[k, 0], apart[k, 1],
-                    compass[0, s], compass[1, s], hints[2, g], hints[3, g], roots[r, 7],
-                    sign[r], modes, roots, r,
+                    compass[0, s], compass[1, s], hints[2, g], hints[3, g], lines[1, g],
+                    hints[4, g], modes, roots, r,
                 )  # fmt: skip
+            # Nearly every pair has two crossings; those are summed up side by side.
+            n_twice = 0
+            for k in range(filled):
+                p = begin + k
+                r = peek(root_first, p)
+                number = peek(root_last, p) - r
+                if number == 2 and peek(roots, ROOT * r + 2) * peek(roots, ROOT * r + 10) < 0.0:
+                    poke(rows, n_twice, ROOT * r)
+                    poke(rows, LISTED + n_twice, ROOT * (r + 1))
+                    poke(target, n_twice, LENS * p)
+                    n_twice += 1
+                elif number > 0:
+                    sum_lens(roots, r, r + number, lenses, p)
+            if n_twice > 0:
+                for k in range(n_twice, (n_twice + LANES - 1) // LANES * LANES):
+                    rows[0, k] = rows[0, n_twice - 1]
+                    rows[1, k] = rows[1, n_twice - 1]
+                    target[k] = target[n_twice - 1]
+                sum_lenses(roots, rows, n_twice, LISTED, lenses, target)

@@ -12,17 +12,15 @@ FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 def rigid_velocity(
     part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
 ) -> None:
-    """Velocity and energy of rigid discs: the overlap of two circles is known in closed form."""
+    """Velocity of rigid discs: the chord of two circles is known in closed form."""
     (
         state, radius, first, other, shift, back_first, back_pair, back_cell, numbers, velocity,
-        energy,
     ) = arrays  # fmt: skip
     n_cells = state.shape[0]
-    v0, k, eta, mu_r = numbers[0], numbers[1], numbers[2], numbers[3]
+    v0, k, mu_r = numbers[0], numbers[1], numbers[3]
     for i in range(part * n_cells // n_parts, (part + 1) * n_cells // n_parts):
         fx = 0.0
         fy = 0.0
-        area = 0.0
         n_own = first[i + 1] - first[i]
         n_all = n_own + back_first[i + 1] - back_first[i]
         for entry in range(n_all):
@@ -39,20 +37,13 @@ def rigid_velocity(
             square = dx * dx + dy * dy
             ri = radius[i]
             rj = radius[j]
-            if square >= (ri + rj) * (ri + rj):
-                continue
-            if square <= (ri - rj) * (ri - rj):
-                area += 0.5 * math.pi * min(ri, rj) ** 2
+            if square >= (ri + rj) * (ri + rj) or square <= (ri - rj) * (ri - rj):
                 continue
             distance = math.sqrt(square)
             along = 0.5 * (square + ri * ri - rj * rj) / distance
             chord = 2.0 * math.sqrt(max(0.0, ri * ri - along * along))
             fx += chord * dx / distance
             fy += chord * dy / distance
-            angle_i = math.acos(max(-1.0, min(1.0, along / ri)))
-            angle_j = math.acos(max(-1.0, min(1.0, (distance - along) / rj)))
-            area += 0.5 * (ri * ri * angle_i + rj * rj * angle_j - 0.5 * distance * chord)
         velocity[i, 0] = v0 * math.cos(state[i, 2]) - mu_r * k * fx
         velocity[i, 1] = v0 * math.sin(state[i, 2]) - mu_r * k * fy
         velocity[i, 2] = 0.0
-        energy[i] = k * area + 2.0 * math.pi * eta * radius[i]

@@ -88,8 +88,7 @@ def settle(
 ) -> None:  # fmt: skip
     """Crossing between two angles from a direction, by safeguarded Newton steps.
 
-    `sign` is that of the depth at the lower end. Stores the directions on i and on j, and the
-    distances to both centres.
+    `sign` is that of the depth at the lower end. Stores a row of `roots` (see `lenses`).
     """
     if not low < angle < high:
         angle = 0.5 * (low + high)
@@ -111,10 +110,12 @@ def settle(
     _, _, rho, distance, ux, uy, _ = gap(record, i, j, dx, dy, c, s, modes)
     roots[row, 0] = c
     roots[row, 1] = s
-    roots[row, 2] = ux
-    roots[row, 3] = uy
-    roots[row, 4] = rho
-    roots[row, 5] = distance
+    roots[row, 2] = sign
+    roots[row, 3] = rho
+    roots[row, 4] = ux
+    roots[row, 5] = uy
+    roots[row, 6] = -sign
+    roots[row, 7] = distance
 
 
 @njit(cache=True, error_model="numpy")
@@ -141,7 +142,7 @@ def fourth_derivative(record: Any, i: int, modes: Any) -> float:
     total = 0.0
     for m in range(len(modes)):
         n = m + 3.0
-        size = math.hypot(record[i, HEAD + m], record[i, HEAD + len(modes) + m])
+        size = math.sqrt(record[i, HEAD + m] ** 2 + record[i, HEAD + len(modes) + m] ** 2)
         total += n * n * n * n * size
     return total
 
@@ -164,12 +165,20 @@ def margin_of(
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def halve_gap(
     record: Any, i: int, j: int, dx: float, dy: float, cosine: float, sine: float,
-    spacing: float, margin: float, modes: Any, stack: Any, found: Any, n_found: int, looks: int,
+    spacing: float, margin: float, g0: float, g1: float, d0: float, d1: float, modes: Any,
+    stack: Any, found: Any, n_found: int, looks: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Bracket the crossings in a gap, whose ends are in row 0 of `stack`, from row n_found on.
+    """Bracket the crossings in a gap, from row n_found on.
 
-    `looks` are still allowed. Returns the number found in all, and the looks left.
+    g and d are the depth and its slope at both ends; `looks` are still allowed. Returns the number
+    found in all, and the looks left.
     """
+    stack[0, 0] = 0.0
+    stack[0, 1] = spacing
+    stack[0, 2] = g0
+    stack[0, 3] = g1
+    stack[0, 4] = d0
+    stack[0, 5] = d1
     height = 1
     while height > 0:
         height -= 1
@@ -233,16 +242,10 @@ def search_gap(
     bend_i = fourth_derivative(record, i, modes)
     bend_j = fourth_derivative(record, j, modes)
     margin = margin_of(bend_i, bend_j, spacing, v0, v1, r0, r1, record[j, 2])
-    stack[0, 0] = 0.0
-    stack[0, 1] = spacing
-    stack[0, 2] = g0
-    stack[0, 3] = g1
-    stack[0, 4] = d0
-    stack[0, 5] = d1
     first = n_found
     n_found, _ = halve_gap(
-        record, i, j, dx, dy, compass[0, s], compass[1, s], spacing, margin, modes, stack, found,
-        n_found, MOST_LOOKS,
+        record, i, j, dx, dy, compass[0, s], compass[1, s], spacing, margin, g0, g1, d0, d1, modes,
+        stack, found, n_found, MOST_LOOKS,
     )  # fmt: skip
     for row in range(first, n_found):
         found[row, 0] = s
@@ -290,16 +293,10 @@ def search_closely(
             g1, d1, _, r1, _, _, v1 = gap(record, i, j, dx, dy, compass[0, t], compass[1, t], modes)
         margin = margin_of(bend_i, bend_j, spacing, v0, v1, r0, r1, mean_j)
         largest = max(largest, abs(g1))
-        stack[0, 0] = 0.0
-        stack[0, 1] = spacing
-        stack[0, 2] = g0
-        stack[0, 3] = g1
-        stack[0, 4] = d0
-        stack[0, 5] = d1
         before = n_found
         n_found, looks = halve_gap(
-            record, i, j, dx, dy, compass[0, s], compass[1, s], spacing, margin, modes, stack,
-            found, n_found, looks,
+            record, i, j, dx, dy, compass[0, s], compass[1, s], spacing, margin, g0, g1, d0, d1,
+            modes, stack, found, n_found, looks,
         )  # fmt: skip
         for row in range(before, n_found):
             found[row, 0] = s

@@ -13,6 +13,7 @@ from numba import njit
 
 from cellquant.sim.grazes import gap
 from cellquant.sim.lanes import QUAD, doubles, gather, load, peek, poke, root, store
+from cellquant.sim.lenses import LENS, ROOT
 from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import shared
 from cellquant.sim.records import HEAD
@@ -27,18 +28,24 @@ SLOTS = 32  # crossings of a cell whose powers are summed at once; even
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def add_powers(side: Any, used: int, modes: Any, tile: Any) -> None:
+def add_powers(roots: Any, places: Any, used: int, modes: Any, tile: Any) -> None:
     """Add sign exp(i n phi) / i of every crossing to the sums of n = 1 .. 2M; empty the slots.
 
-    Rows of `side`, SLOTS QUAD apart: sign, cosine and sine of phi, one lane per cell. Row n of
-    `tile`, QUAD apart, takes the real parts, row 2M + 1 + n the imaginary ones.
+    `places` says where the numbers of the crossings begin, those of one cell QUAD apart; slots that
+    are empty point to the last row of `roots`. Row n of `tile`, QUAD apart, takes the real parts,
+    row 2M + 1 + n the imaginary ones.
     """
     n_powers = 2 * len(modes) + 3
     half = n_powers * QUAD
     for slot in range(0, used, 2):
-        p = slot * QUAD
-        c_0, s_0, twice_0, before_c0, before_s0 = first_power(side, p)
-        c_1, s_1, twice_1, before_c1, before_s1 = first_power(side, p + QUAD)
+        c_0, s_0, before_c0, _ = gather(roots, places, slot * QUAD, 0)
+        c_1, s_1, before_c1, _ = gather(roots, places, (slot + 1) * QUAD, 0)
+        twice_0 = 2.0 * c_0
+        twice_1 = 2.0 * c_1
+        before_s0 = doubles(0.0)
+        before_s1 = doubles(0.0)
+        c_0, s_0 = before_c0 * c_0, before_c0 * s_0
+        c_1, s_1 = before_c1 * c_1, before_c1 * s_1
         for n in range(1, n_powers, 2):
             at = n * QUAD
             store(tile, at, load(tile, at) + (s_0 + s_1))
@@ -54,18 +61,8 @@ def add_powers(side: Any, used: int, modes: Any, tile: Any) -> None:
             s_0 = twice_0 * before_s0 - s_0
             c_1 = twice_1 * before_c1 - c_1
             s_1 = twice_1 * before_s1 - s_1
-    for slot in range((used + 1) // 2 * 2):
-        store(side, slot * QUAD, doubles(0.0))
-
-
-@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def first_power(side: Any, p: int) -> tuple[Any, Any, Any, Any, Any]:
-    """Sign times cosine and sine, twice the cosine, and sign times the powers of order zero."""
-    sign = load(side, p)
-    cosine = load(side, SLOTS * QUAD + p)
-    return (
-        sign * cosine, sign * load(side, 2 * SLOTS * QUAD + p), 2.0 * cosine, sign, doubles(0.0)
-    )  # fmt: skip
+    for slot in range((used + 1) // 2 * 2 * QUAD):
+        poke(places, slot, ROOT * (roots.shape[0] - 1))
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
@@ -113,28 +110,44 @@ def fill_lanes(record: Any, tangent: Any, rows: Any, modes: Any, tension: Any, l
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def shape_forces(
-    tile: Any, lane: Any, inverse: Any, k: float, eta: float, modes: Any, tension: Any, out: Any
+    tile: Any,
+    wave: Any,
+    lane: Any,
+    inverse: Any,
+    k: float,
+    eta: float,
+    modes: Any,
+    tension: Any,
+    out: Any,
 ) -> None:
     """Convolve W with the modes, for a tile of cells.
 
+    `tile` holds n W_n (and W_0), `wave` takes W_n for n = 1 - M .. 2M; both real parts first.
     Rows of `lane`: see `fill_lanes`. Rows of `out`: the overlap integral, dH/da_n and dH/db_n over
     R0, then dH/dA0. `inverse` holds 1 and 1 / n.
     """
     n_modes = len(modes)
-    half = (2 * n_modes + 3) * QUAD
-    for n in range(2, 2 * n_modes + 3):
-        store(tile, n * QUAD, load(tile, n * QUAD) * inverse[n])
-        store(tile, half + n * QUAD, load(tile, half + n * QUAD) * inverse[n])
+    n_powers = 2 * n_modes + 3
+    half = (n_modes + n_powers) * QUAD
+    zero = n_modes * QUAD
+    for n in range(n_powers):
+        re = load(tile, n * QUAD) * inverse[n]
+        im = load(tile, (n_powers + n) * QUAD) * inverse[n]
+        store(wave, zero + n * QUAD, re)
+        store(wave, half + zero + n * QUAD, im)
+        if 0 < n < n_modes:
+            store(wave, zero - n * QUAD, re)
+            store(wave, half + zero - n * QUAD, -im)
     mean = load(lane, 0)
     cos_1 = load(lane, QUAD)
     sin_1 = load(lane, 2 * QUAD)
     real = 4 * QUAD
     imaginary = (4 + n_modes) * QUAD
     length = (4 + (2 * n_modes + 3) // 4 * 4) * QUAD
-    j0 = mean * load(tile, 0)
+    j0 = mean * load(wave, zero)
     for m in range(n_modes):
-        j0 += load(lane, real + m * QUAD) * load(tile, (m + 2) * QUAD)
-        j0 -= load(lane, imaginary + m * QUAD) * load(tile, half + (m + 2) * QUAD)
+        j0 += load(lane, real + m * QUAD) * load(wave, zero + (m + 2) * QUAD)
+        j0 -= load(lane, imaginary + m * QUAD) * load(wave, half + zero + (m + 2) * QUAD)
     area = mean * j0
     constant = k * j0
     if len(tension) > 0:
@@ -145,25 +158,30 @@ def shape_forces(
     for m in range(n_modes):
         n = m + 2
         cos_n, sin_n = cos_n * cos_1 - sin_n * sin_1, sin_n * cos_1 + cos_n * sin_1
-        jr = mean * load(tile, n * QUAD)
-        ji = mean * load(tile, half + n * QUAD)
+        # Sums of products in four chains, so that they seldom wait for each other.
+        jr = doubles(0.0)
+        ji = doubles(0.0)
+        kr = doubles(0.0)
+        ki = doubles(0.0)
         for q in range(n_modes):
-            cr = 0.5 * load(lane, real + q * QUAD)
-            ci = 0.5 * load(lane, imaginary + q * QUAD)
-            up = (n + q + 2) * QUAD
-            ur = load(tile, up)
-            ui = load(tile, half + up)
-            jr += cr * ur - ci * ui
-            ji += cr * ui + ci * ur
-            low = abs(m - q) * QUAD
-            lr = load(tile, low)
-            li = load(tile, half + low)
-            if q <= m:
-                jr += cr * lr + ci * li
-                ji += cr * li - ci * lr
-            else:
-                jr += cr * lr - ci * li
-                ji -= cr * li + ci * lr
+            cr = load(lane, real + q * QUAD)
+            ci = load(lane, imaginary + q * QUAD)
+            up = zero + (n + q + 2) * QUAD
+            ur = load(wave, up)
+            ui = load(wave, half + up)
+            jr += cr * ur
+            kr -= ci * ui
+            ji += cr * ui
+            ki += ci * ur
+            low = zero + (m - q) * QUAD
+            lr = load(wave, low)
+            li = load(wave, half + low)
+            jr += cr * lr
+            kr += ci * li
+            ji += cr * li
+            ki -= ci * lr
+        jr = mean * load(wave, zero + n * QUAD) + 0.5 * (jr + kr)
+        ji = mean * load(wave, half + zero + n * QUAD) + 0.5 * (ji + ki)
         area += load(lane, real + m * QUAD) * jr - load(lane, imaginary + m * QUAD) * ji
         jr *= k
         ji *= k
@@ -185,11 +203,13 @@ def exact_velocity(
 ) -> None:
     """Generalised velocity, energy and dH/dA0 of every cell from the crossings of its contour.
 
+    The energy lacks the areas of the lenses, see `energies`.
+
     `numbers` holds v0, k, eta, mu_r, mu_theta, mu_ab.
     """
     (
         state, radius, record, tangent, first, second, back_first, back_pair, back_cell, roots,
-        root_first, root_last, sign, inside, numbers, velocity, energy, growth,
+        root_first, root_last, lenses, inside, numbers, velocity, energy, growth,
     ) = arrays  # fmt: skip
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
@@ -199,12 +219,12 @@ def exact_velocity(
     n_powers = 2 * len(modes) + 3
     inverse = 1.0 / np.maximum(np.arange(n_powers), 1)
     tile = np.empty(2 * n_powers * QUAD)
+    wave = np.zeros(2 * (n_modes + n_powers) * QUAD)
     lane = np.empty((12 + 4 * n_modes) * QUAD)
     rows = np.empty(2 * QUAD, np.int64)
     out = np.empty((2 + 2 * n_modes) * QUAD)
-    lens = np.empty(QUAD)
     rest = np.zeros(2 * QUAD)
-    side = np.zeros(3 * SLOTS * QUAD)
+    places = np.full(SLOTS * QUAD, ROOT * (roots.shape[0] - 1))
     for block in range(n_blocks):
         if not part * n_blocks <= block * n_parts < (part + 1) * n_blocks:
             continue
@@ -222,7 +242,6 @@ def exact_velocity(
                 fx = 0.0
                 fy = 0.0
                 spin = 0.0
-                shared = 0.0
                 whole = 0.0
                 filled = 0
                 arcs_r = 1.0
@@ -237,37 +256,24 @@ def exact_velocity(
                         p = peek(back_pair, back_first[i] + entry - n_own)
                     if peek(inside, p) == (1 if own else 2):
                         whole += 2.0 * math.pi
-                    if peek(root_first, p) == peek(root_last, p):
+                    begin_of_it = peek(root_first, p)
+                    end_of_it = peek(root_last, p)
+                    if begin_of_it == end_of_it:
                         continue
-                    arc_r = 1.0
-                    arc_i = 0.0
-                    for r in range(peek(root_first, p), peek(root_last, p)):
-                        at = r * roots.shape[1]
-                        if own:
-                            s = peek(sign, r)
-                            c1 = peek(roots, at)
-                            s1 = peek(roots, at + 1)
-                            distance = peek(roots, at + 4)
-                            turned = c1 * peek(roots, at + 3) - s1 * peek(roots, at + 2)
-                            shared -= 0.5 * s * distance * peek(roots, at + 5) * turned
-                        else:
-                            s = -peek(sign, r)
-                            c1 = peek(roots, at + 2)
-                            s1 = peek(roots, at + 3)
-                            distance = peek(roots, at + 5)
-                        push = s * distance
-                        fx += push * s1
-                        fy -= push * c1
-                        spin += 0.5 * push * distance
-                        turned = s * s1
-                        arc_r, arc_i = arc_r * c1 - arc_i * turned, arc_i * c1 + arc_r * turned
+                    turn = 1.0 if own else -1.0
+                    side = 0 if own else 1
+                    at = LENS * p
+                    fx += turn * peek(lenses, at)
+                    fy += turn * peek(lenses, at + 1)
+                    spin += peek(lenses, at + 2 + side)
+                    arc_r = peek(lenses, at + 4 + 2 * side)
+                    arc_i = peek(lenses, at + 5 + 2 * side)
+                    for r in range(begin_of_it, end_of_it):
                         if filled == SLOTS:
-                            add_powers(side, SLOTS, modes, tile)
+                            add_powers(roots, places, SLOTS, modes, tile)
                             filled = 0
                             used = 0
-                        poke(side, filled * QUAD + column, s)
-                        poke(side, (SLOTS + filled) * QUAD + column, c1)
-                        poke(side, (2 * SLOTS + filled) * QUAD + column, s1)
+                        poke(places, filled * QUAD + column, ROOT * r + 4 * side)
                         filled += 1
                     if arc_r > 0.0 and arc_i >= 0.0:
                         # Short arcs are added by turning one by the other, quarter turns apart.
@@ -287,13 +293,12 @@ def exact_velocity(
                         angle += 2.0 * math.pi
                         if angle > 2.0 * math.pi - 1e-6:
                             # Round-off, or a cell inside but for a sliver: ask its far side.
-                            r = root_first[p]
-                            dx = roots[r, 4] * roots[r, 0] - roots[r, 5] * roots[r, 2]
-                            dy = roots[r, 4] * roots[r, 1] - roots[r, 5] * roots[r, 3]
+                            r = begin_of_it
+                            dx = roots[r, 3] * roots[r, 0] - roots[r, 7] * roots[r, 4]
+                            dy = roots[r, 3] * roots[r, 1] - roots[r, 7] * roots[r, 5]
                             # The pair is the same seen from either cell but for its sign.
-                            turn = 1.0 if own else -1.0
-                            c1 = -(roots[r, 0] if own else roots[r, 2])
-                            s1 = -(roots[r, 1] if own else roots[r, 3])
+                            c1 = -roots[r, 4 * side]
+                            s1 = -roots[r, 4 * side + 1]
                             j = second[p]
                             if not own:
                                 j = back_cell[back_first[i] + entry - n_own]
@@ -310,16 +315,15 @@ def exact_velocity(
                 velocity[i, 0] = v0 * record[i, 5] - mu_r * k * fx
                 velocity[i, 1] = v0 * record[i, 6] - mu_r * k * fy
                 velocity[i, 2] = mu_theta * k * spin if len(torque) > 0 else 0.0
-                lens[column] = shared
             store(tile, 0, load(tile, 0) + angle_of(load(rest, 0), load(rest, QUAD)))
             if used > 0:
-                add_powers(side, used, modes, tile)
-            shape_forces(tile, lane, inverse, k, eta, modes, tension, out)
+                add_powers(roots, places, used, modes, tile)
+            shape_forces(tile, wave, lane, inverse, k, eta, modes, tension, out)
             for column in range(min(QUAD, end - begin)):
                 i = begin + column
                 scale = mu_ab * radius[i]
                 for m in range(2 * n_modes):
                     velocity[i, 3 + m] = -scale * out[(1 + m) * QUAD + column]
                 bound = eta * tangent[i, 0] if len(tension) > 0 else 0.0
-                energy[i] = bound + k * (0.5 * out[column] + lens[column])
+                energy[i] = bound + 0.5 * k * out[column]
                 growth[i] = out[(1 + 2 * n_modes) * QUAD + column]

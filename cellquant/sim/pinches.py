@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from cellquant.sim.crossings import ROOT
+from cellquant.sim.lenses import sum_lens
 from cellquant.sim.records import HEAD
 
 NARROW = 0.3  # radius over R0 below which crossings are sought on this contour: its own radius
@@ -26,6 +26,7 @@ SHARP = 0.05  # radius over R0 below which the contour's length needs graded pan
 SAMPLES = 128  # of R(phi), between which its zeros are sought
 SHORTEST = 1e-5  # gaps in a contour of a smaller angle are left out
 MOST_ZEROS = 48  # of a contour of 24 modes
+MOST_PANELS = 1024  # of a contour whose tangent nearly vanishes in places
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
@@ -148,19 +149,18 @@ def alternate(angle: Any, sign: Any, count: int) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def centre_is_held(
-    roots: Any, sign: Any, start: int, stop: int, second: bool, ends: Any, n_ends: int, room: Any
+    roots: Any, start: int, stop: int, second: bool, ends: Any, n_ends: int, room: Any
 ) -> bool:  # fmt: skip
     """Whether the arcs of a pinched cell inside its neighbour end at its gaps.
 
     They do where the neighbour holds the cell's centre, and only then do the signs of the
     crossings and of the gaps alternate round the contour.
     """
-    column = 2 if second else 0
-    side = -1.0 if second else 1.0
+    column = 4 if second else 0
     count = 0
     for r in range(start, stop):
         room[0, count] = math.atan2(roots[r, column + 1], roots[r, column]) % (2.0 * math.pi)
-        room[1, count] = side * sign[r]
+        room[1, count] = roots[r, column + 2]
         count += 1
     for e in range(n_ends):
         room[0, count] = ends[e] % (2.0 * math.pi)
@@ -172,7 +172,7 @@ def centre_is_held(
 @njit(cache=True, error_model="numpy")
 def add_gaps(
     record: Any, pinched: Any, first: Any, other: Any, roots: Any, root_first: Any, root_last: Any,
-    sign: Any, inside: Any, tail: int, n_modes: int,
+    lenses: Any, inside: Any, tail: int, n_modes: int,
 ) -> int:  # fmt: skip
     """Put the gaps of pinched contours among the crossings of their pairs, from `tail` on.
 
@@ -198,46 +198,74 @@ def add_gaps(
             n_j = gaps(record, j, n_modes, ends[1]) if pinched[j] else 0
             begin = tail
             for r in range(start, stop):
-                if roots[r, 4] > 0.0:
+                if roots[r, 3] > 0.0:
                     roots[tail] = roots[r]
-                    sign[tail] = sign[r]
                     tail += 1
             crossed = tail
             if n_i > 0 and inside[p] != 2 and centre_is_held(
-                roots, sign, begin, crossed, False, ends[0], n_i, room
+                roots, begin, crossed, False, ends[0], n_i, room
             ):  # fmt: skip
                 for e in range(n_i):
+                    roots[tail] = 0.0
                     roots[tail, 0] = math.cos(ends[0, e])
                     roots[tail, 1] = math.sin(ends[0, e])
-                    roots[tail, 2] = 1.0
-                    roots[tail, 3:ROOT] = 0.0
-                    sign[tail] = 1.0 if e % 2 == 0 else -1.0
+                    roots[tail, 2] = 1.0 if e % 2 == 0 else -1.0
+                    roots[tail, 4] = 1.0
+                    roots[tail, 6] = -roots[tail, 2]
                     tail += 1
                 inside[p] = 0
             if n_j > 0 and inside[p] != 1 and centre_is_held(
-                roots, sign, begin, crossed, True, ends[1], n_j, room
+                roots, begin, crossed, True, ends[1], n_j, room
             ):  # fmt: skip
                 for e in range(n_j):
                     roots[tail] = 0.0
                     roots[tail, 0] = 1.0
-                    roots[tail, 2] = math.cos(ends[1, e])
-                    roots[tail, 3] = math.sin(ends[1, e])
-                    sign[tail] = -1.0 if e % 2 == 0 else 1.0
+                    roots[tail, 2] = -1.0 if e % 2 == 0 else 1.0
+                    roots[tail, 4] = math.cos(ends[1, e])
+                    roots[tail, 5] = math.sin(ends[1, e])
+                    roots[tail, 6] = -roots[tail, 2]
                     tail += 1
                 inside[p] = 0
             root_first[p] = begin
             root_last[p] = tail
+            sum_lens(roots, begin, tail, lenses, p)
     return tail
 
 
 @njit(cache=True, error_model="numpy")
-def measure_lengths(record: Any, cells: Any, n_modes: int, tangent: Any) -> None:
-    """Length of some contours and their gradients (see `outlines.contours`) on graded panels.
+def graded_panels(
+    record: Any, i: int, begin: float, whole: float, n_panels: int, bend: float, n_modes: int,
+    panels: Any,
+) -> int:  # fmt: skip
+    """Divide a part of contour i where its tangent could vanish; return the number of panels.
 
-    The integrand is as smooth as its smallest tangent is long; panels are halved until they are
-    shorter than their distance from the place where the tangent could vanish.
+    The integrand of a length is as smooth as its smallest tangent is long: panels are halved until
+    they are shorter than their distance from the place where it could vanish, |t| / `bend`. Rows of
+    `panels` take start and width; where there is no row left they stay as wide as they are.
     """
-    stack = np.empty((64, 2))
+    for panel in range(n_panels):
+        panels[panel, 0] = begin + panel * whole / n_panels
+        panels[panel, 1] = whole / n_panels
+    count = n_panels
+    panel = 0
+    while panel < count:
+        width = panels[panel, 1]
+        rho, slope = radius_towards(record, i, panels[panel, 0] + 0.5 * width, n_modes)
+        halved = math.hypot(rho, slope) < bend * width and width > 1e-9
+        if halved and count < panels.shape[0]:
+            panels[panel, 1] = 0.5 * width
+            panels[count, 0] = panels[panel, 0] + 0.5 * width
+            panels[count, 1] = 0.5 * width
+            count += 1
+        else:
+            panel += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def measure_lengths(record: Any, cells: Any, n_modes: int, tangent: Any) -> None:
+    """Length of some contours and their gradients (see `outlines.contours`) on graded panels."""
+    panels = np.empty((MOST_PANELS, 2))
     for i in cells:
         bend = record[i, 2]
         for m in range(n_modes):
@@ -246,39 +274,27 @@ def measure_lengths(record: Any, cells: Any, n_modes: int, tangent: Any) -> None
                 record[i, HEAD + m], record[i, HEAD + n_modes + m]
             )
         tangent[i, :] = 0.0
-        for start in range(16):
-            stack[0, 0] = start * math.pi / 8.0
-            stack[0, 1] = math.pi / 8.0
-            height = 1
-            while height > 0:
-                height -= 1
-                low = stack[height, 0]
-                width = stack[height, 1]
-                rho, slope = radius_towards(record, i, low + 0.5 * width, n_modes)
-                if math.hypot(rho, slope) < bend * width and width > 1e-9:
-                    stack[height, 0] = low
-                    stack[height, 1] = 0.5 * width
-                    stack[height + 1, 0] = low + 0.5 * width
-                    stack[height + 1, 1] = 0.5 * width
-                    height += 2
+        count = graded_panels(record, i, 0.0, 2.0 * math.pi, 16, bend, n_modes, panels)
+        for panel in range(count):
+            low = panels[panel, 0]
+            width = panels[panel, 1]
+            for g in range(NODES.shape[0]):
+                angle = low + 0.5 * width * (1.0 + NODES[g])
+                share = 0.5 * width * WEIGHTS[g]
+                rho, slope = radius_towards(record, i, angle, n_modes)
+                stretch = math.hypot(rho, slope)
+                if stretch == 0.0:
                     continue
-                for g in range(NODES.shape[0]):
-                    angle = low + 0.5 * width * (1.0 + NODES[g])
-                    share = 0.5 * width * WEIGHTS[g]
-                    rho, slope = radius_towards(record, i, angle, n_modes)
-                    stretch = math.hypot(rho, slope)
-                    if stretch == 0.0:
-                        continue
-                    tangent[i, 0] += share * stretch
-                    u = share * rho / stretch
-                    v = share * slope / stretch
-                    tangent[i, 1] += u
-                    c_1 = math.cos(angle)
-                    s_1 = math.sin(angle)
-                    c = c_1
-                    s = s_1
-                    for m in range(n_modes):
-                        n = m + 2
-                        c, s = c * c_1 - s * s_1, s * c_1 + c * s_1
-                        tangent[i, 2 + m] += u * c - n * v * s
-                        tangent[i, 2 + n_modes + m] += u * s + n * v * c
+                tangent[i, 0] += share * stretch
+                u = share * rho / stretch
+                v = share * slope / stretch
+                tangent[i, 1] += u
+                c_1 = math.cos(angle)
+                s_1 = math.sin(angle)
+                c = c_1
+                s = s_1
+                for m in range(n_modes):
+                    n = m + 2
+                    c, s = c * c_1 - s * s_1, s * c_1 + c * s_1
+                    tangent[i, 2 + m] += u * c - n * v * s
+                    tangent[i, 2 + n_modes + m] += u * s + n * v * c

@@ -30,6 +30,7 @@ from cellquant.sim.lanes import (
 )
 from cellquant.sim.records import HEAD
 
+END_MARGIN = 2e-6  # of a sample in single precision, relative to A0
 FINE_MARGIN = 1e-5  # of the interpolation through four samples, single precision included
 BENT = 1e-3  # of A0: of what degree 7 bends the cubic by, it leaves a share of this over it squared
 MISSED = 3.0  # times that may be left where it bends by more
@@ -164,7 +165,8 @@ def judge_gaps(
         close = either(both(near_1, absolute(p1) - margin), both(near_2, absolute(p2) - margin))
         thrice = both(both(change_1, change_2), change_3)
         unsure = either(either(close, greatest(b1, b2) - flat), thrice)
-        ends = least(absolute(g0), absolute(g1)) - margin
+        # At a sample the interpolation is no worse than the sample.
+        ends = least(absolute(g0), absolute(g1)) - choose(inner > 0.0, END_MARGIN * a0, flat)
         unsure = either(unsure, ends)
         one, none = singles_pair(1.0), singles_pair(0.0)
         number = pick(change_1, one, none) + pick(change_2, one, none) + pick(change_3, one, none)
@@ -173,6 +175,7 @@ def judge_gaps(
             high = pick(change_3, one, pick(change_2, t2, t1))
             begin_of_it = pick(change_1, t1, t2)
             end_of_it = singles_pair(1.0 + BEYOND)
+            store(hints, 4 * room + g, pick(g0, one, -one))
         else:
             # The first piece between extrema that crosses zero, or else the last one.
             hidden = pick(ROUGH * a0 - bent, singles_pair(HIDDEN), singles_pair(UNSURE))
@@ -180,6 +183,7 @@ def judge_gaps(
             low = pick(change_1, none, pick(change_2, t1, t2))
             high = pick(change_1, t1, pick(change_2, t2, one))
             begin_of_it = singles_pair(-BEYOND)
+            store(hints, 4 * room + g, pick(g0, -one, one))
             end_of_it = choose(number == TWO, pick(change_1, t1, t2), 1.0 + BEYOND)
         store(hints, 2 * room + g, begin_of_it * spacing)
         store(hints, 3 * room + g, end_of_it * spacing)
@@ -254,9 +258,9 @@ def polish(
     """Step of order three on the crossing in every listed gap, then its data.
 
     Rows of `rows`: where the numbers of its sample, its pair, i and j begin. Rows of `hints`: angle
-    from the sample, second derivative of the depth, and the bracket. `target` says where in `roots`
-    the row of each root begins; row 0 of `lines` takes its error. Each pass is short, so that
-    operations seldom wait for each other.
+    from the sample, second derivative of the depth, the bracket and the sign. `target` says where
+    in `roots` the row of each root begins; row 0 of `lines` takes its error, row 1 the angle. Each
+    pass is short, so that operations seldom wait for each other.
     """
     room = rows.shape[1]
     for r in range(begin, end, LANES):
@@ -324,5 +328,7 @@ def polish(
         error = newton * newton + 0.02 * absolute(newton * second)
         error = choose(inside, error, 1.0)
         store(lines, r, error)
-        scatter_rows(roots, target, r, 0, c, s, x * inverse, y * inverse)
-        scatter_rows(roots, target, r, 4, rho, square * inverse, error, moved)
+        store(lines, room + r, moved)
+        sign = widen_pair(hints, 4 * room + r)
+        scatter_rows(roots, target, r, 0, c, s, sign, rho)
+        scatter_rows(roots, target, r, 4, x * inverse, y * inverse, -sign, square * inverse)

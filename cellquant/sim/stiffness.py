@@ -23,7 +23,6 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from cellquant.sim.contacts import Layer
-from cellquant.sim.crossings import ROOT
 from cellquant.sim.lanes import (
     LANES,
     absolute,
@@ -34,6 +33,7 @@ from cellquant.sim.lanes import (
     scatter,
     store,
 )
+from cellquant.sim.lenses import ROOT
 from cellquant.sim.records import HEAD
 
 Floats = NDArray[np.float64]
@@ -62,7 +62,7 @@ def list_crossings(
     for i in range(first.shape[0] - 1):
         for p in range(first[i], first[i + 1]):
             for r in range(root_first[p], root_last[p]):
-                if roots[r, 4] == 0.0 or roots[r, 5] == 0.0:
+                if roots[r, 3] == 0.0 or roots[r, 7] == 0.0:
                     continue  # an arc that ends at the centre of a pinched cell, no crossing
                 if count < cells.shape[0]:
                     rows[0, count] = stride * i
@@ -100,8 +100,8 @@ def gather(
     share = np.empty(LANES)
     total = 0.0
     for r in range(0, padded, LANES):
-        c, s, c_2, s_2 = gather_pair(roots, rows, 2 * room + r, 0)
-        rho, rho_2, _, _ = gather_pair(roots, rows, 2 * room + r, 4)
+        c, s, _, rho = gather_pair(roots, rows, 2 * room + r, 0)
+        c_2, s_2, _, rho_2 = gather_pair(roots, rows, 2 * room + r, 4)
         ax = c
         ay = c
         squares = c
