@@ -36,7 +36,7 @@ from cellquant.sim.records import HEAD, write_records
 GUESS = 0x5FE6EB50C7B537A9  # bits from which those of 1 / sqrt follow, to 3 %
 BLOCK = 32  # cells worked on together
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
-ROUGH = 8e-5  # alternating sum above which the trapezoid rule takes twice the points
+ROUGH = 6e-5  # alternating sum above which the trapezoid rule takes twice the points
 POINTS = 32  # of the trapezoid rule, worked on together; even
 LEVELS = 5  # 16 max(6, M) - 8 points, doubled at most four times
 SLACK = 1e-6  # rounding of single-precision samples, relative to A0
