@@ -20,10 +20,10 @@ from cellquant.segment import measure_cells
 from cellquant.tables import PIXEL, TRACK_COLUMNS, Cells
 from cellquant.track import track_cells
 from cellquant.track.assign import match, match_with_divisions
+from cellquant.track.belief import marginals
 from cellquant.track.divisions import _log_frequency, broken_masks, weigh
 from cellquant.track.evaluate import evaluate
 from cellquant.track.flow import pair_flow
-from cellquant.track.kernels import marginals
 from cellquant.track.movie import Links, flatten
 from cellquant.track.near import nearest_cells
 from cellquant.track.solve import Options, solve

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cellquant.track.fates import Fates
-from cellquant.track.kernels import link_steps, neighbour_mean, pair_gains, steps_ahead
+from cellquant.track.motion_kernels import link_steps, neighbour_mean, pair_gains, steps_ahead
 from cellquant.track.movie import LOG_AREA, NEAR, BoolArray, FloatArray, IntArray, Links, Movie
 from cellquant.track.shapes import TAIL, Shapes
 

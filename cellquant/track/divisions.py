@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from cellquant.track.kernels import division_gains
+from cellquant.track.family_kernels import division_gains
 from cellquant.track.movie import LOG_AREA, BoolArray, FloatArray, IntArray, Links, Movie
 
 _PRIOR_DIVISIONS = 10.0

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from cellquant.track.kernels import soft_flow
+from cellquant.track.motion_kernels import soft_flow
 from cellquant.track.movie import FloatArray, Movie
 from cellquant.track.near import nearest_cells
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cellquant.track.cues import Look
-from cellquant.track.kernels import overlap_shares, patch_correlations
 from cellquant.track.movie import LOG_AREA, FloatArray, IntArray, Movie
+from cellquant.track.shape_kernels import overlap_shares, patch_correlations
 
 if TYPE_CHECKING:
     from cellquant.io import ImageStack, LabelStack

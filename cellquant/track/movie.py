@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from cellquant.tables import Cells
-from cellquant.track.kernels import widest_gaps
 from cellquant.track.near import nearest_cells
+from cellquant.track.shape_kernels import widest_gaps
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cellquant.track.assign import match_with_divisions
+from cellquant.track.belief import marginals
 from cellquant.track.costs import (
     Motion,
     Paths,
@@ -31,7 +32,6 @@ from cellquant.track.divisions import (
 from cellquant.track.fates import Fates, Rates, fates, fit_rates, places, suppose_divisions
 from cellquant.track.flow import CANDIDATES, all_flows
 from cellquant.track.images import PairImages
-from cellquant.track.kernels import marginals
 from cellquant.track.movie import BoolArray, FloatArray, IntArray, Links, Movie
 from cellquant.track.near import nearest_cells
 from cellquant.track.shapes import Shapes, fit_shapes, population_of
