@@ -20,7 +20,8 @@ from cellquant.segment import measure_cells
 from cellquant.tables import PIXEL, TRACK_COLUMNS, Cells
 from cellquant.track import track_cells
 from cellquant.track.assign import match, match_with_divisions
-from cellquant.track.belief import marginals
+from cellquant.track.belief import marginals, option_marginals
+from cellquant.track.confidence import Choice, calibrated
 from cellquant.track.divisions import _log_frequency, broken_masks, weigh
 from cellquant.track.evaluate import evaluate
 from cellquant.track.flow import pair_flow
@@ -400,6 +401,45 @@ def test_marginals_are_those_of_all_matchings() -> None:
             weight[key] += worth
     assert out[:3] == pytest.approx(weight / total, abs=1e-6)
     assert (out[3:] == 0.0).all()
+
+
+def test_links_and_divisions_are_judged_together() -> None:
+    """Exact where options and cells form a tree, by counting every way to choose."""
+    # Sources 0 and 1, targets 2 to 5.
+    cells = np.array([[0, 2, -1], [0, 3, 4], [1, 3, -1], [1, 5, -1]])
+    gain = np.array([1.0, 2.5, 1.5, -0.5])
+    out = np.empty(4)
+    option_marginals(cells, gain, 8, out)
+    weight, total = np.zeros(4), 0.0
+    for taken in product((False, True), repeat=4):
+        used = cells[list(taken)]
+        used = used[used >= 0]
+        if len(set(used.tolist())) == len(used):
+            worth = np.exp(gain[list(taken)].sum())
+            total += worth
+            weight[list(taken)] += worth
+    assert out == pytest.approx(weight / total, abs=1e-6)
+
+
+def test_confidence_is_cooler_where_links_are_in_doubt() -> None:
+    nobody = np.full(8, -1)
+    # Two links and a division, each with one rival; cells 0 to 2 are followed by 3 to 7.
+    cells = np.array([[0, 3, -1], [0, 4, -1], [1, 4, -1], [2, 7, -1], [2, 5, 6]])
+    gain = np.array([7.0, 1.0, 7.0, 2.0, 10.0])
+    choice = Choice(cells, gain, np.array([0, 2]), np.array([4]))
+    stated = {}
+    for doubt in (0.001, 0.02):
+        before = np.zeros(8)
+        before[[3, 4]] = 1.0 - doubt
+        links = calibrated(Links(nobody, nobody, nobody, before), choice)
+        stated[doubt] = links.confidence
+        # The division against nothing and against another link of its mother, at a quarter.
+        division, rival = np.exp(10.0 / 4.0), np.exp(2.0 / 4.0)
+        assert links.confidence[5] == links.confidence[6]
+        assert links.confidence[5] == pytest.approx(division / (1.0 + rival + division))
+        assert links.confidence[7] == 0.0
+    assert stated[0.001][3] == pytest.approx(1.0 / (1.0 + np.exp(-7.0)), abs=1e-5)
+    assert stated[0.02][3] < 0.95
 
 
 def test_a_sure_link_is_not_propagated_and_keeps_its_odds() -> None:

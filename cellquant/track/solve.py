@@ -8,6 +8,7 @@ import numpy as np
 
 from cellquant.track.assign import match_with_divisions
 from cellquant.track.belief import marginals
+from cellquant.track.confidence import Choice, calibrated
 from cellquant.track.costs import (
     Motion,
     Paths,
@@ -91,6 +92,7 @@ class Solution:
     cues: list[Cue | None] = field(default_factory=list)
     family_cues: list[Cue | None] = field(default_factory=list)
     gain: FloatArray | None = None
+    choice: Choice | None = None
     fates: Fates | None = None
 
 
@@ -178,6 +180,8 @@ def solve(
         turn += 1
         if progress is not None:
             progress(frames * (turn - first + 1) // total, frames)
+    if state.links is not None and state.choice is not None:
+        state.links = calibrated(state.links, state.choice)
     if state.links is not None and state.divisions is not None and len(state.divisions.width) > 2:
         state.links = _mended(movie, state.links)
     if progress is not None:
@@ -356,6 +360,13 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
         np.maximum.at(reached, column, sure)
         families, odds, whole, looks = _families(state, reached < _SURE, middle, images)
     chosen, split = match_with_divisions(row, column, gain[row, slot], families, odds)
+    alone = np.full(len(row), -1)
+    state.choice = Choice(
+        cells=np.concatenate((np.column_stack((row, column, alone)), families)),
+        gain=np.concatenate((gain[row, slot], odds)),
+        links=chosen,
+        divisions=len(row) + split,
+    )
     state.families = weigh(families, odds, split, row[chosen], column[chosen], candidates, gain)
     if looks:
         taken = np.zeros(len(odds), dtype=bool)
