@@ -36,12 +36,14 @@ class Rates:
 @dataclass(frozen=True)
 class Fates:
     """Log chance of every cell (N,) to stay, vanish and divide before the next frame, and to have
-    appeared since the last, per area."""
+    appeared since the last, per area: ``appear`` where the size of cells that the edge cuts is not
+    compared, ``appear_sized`` where it is."""
 
     stay: FloatArray
     vanish: FloatArray
     divide: FloatArray
     appear: FloatArray
+    appear_sized: FloatArray
 
 
 def places(movie: Movie, flow: FloatArray) -> tuple[IntArray, IntArray]:
@@ -141,29 +143,33 @@ def fates(
     appear = rates.appear[frames, entering]
     divide = rates.divide[frames]
     stay = np.maximum(1.0 - vanish - divide, 0.1)
+    sized = appear.copy()
     if links is not None:
         size = movie.shape[:, LOG_AREA]
         cell, last, first = np.arange(movie.n_cells), movie.start[-2], movie.start[1]
         gone = (cell < last) & (links.after < 0)
         split = (cell < last) & (links.second >= 0)
         new = (cell >= first) & (links.before < 0)
-        # What is seen of cells that the edge cuts is compared among them.
+        # What is seen of cells that the edge cuts is compared among them, and tells of newcomers
+        # alone: links of such cells do not compare sizes.
         for kind in (movie.cut, ~movie.cut):
             if not kind.any():
                 continue
             usual = _size_law(size[(cell < last) & kind & ~gone & ~split], None)
-            vanish[kind] *= _size_ratio(size[kind], size[gone & kind], usual)
-            appear[kind] *= _size_ratio(size[kind], size[new & kind], usual)
+            sized[kind] *= _size_ratio(size[kind], size[new & kind], usual)
             if kind is not movie.cut:
+                vanish[kind] *= _size_ratio(size[kind], size[gone & kind], usual)
                 divide[kind] *= _size_ratio(size[kind], size[split & kind], usual)
         total = stay + vanish + divide
         stay, vanish, divide = stay / total, vanish / total, divide / total
-        appear = np.minimum(appear, _MOST)
+        sized = np.minimum(sized, _MOST)
+        appear = np.where(movie.cut, appear, sized)
     return Fates(
         np.log(np.maximum(stay, 1e-6)),
         np.log(np.maximum(vanish, 1e-9)),
         np.log(np.maximum(divide, 1e-12)),
         np.log(appear * movie.density),
+        np.log(sized * movie.density),
     )
 
 

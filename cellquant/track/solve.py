@@ -325,7 +325,7 @@ def _families(
         float(state.motion.tail[0]),
         state.fates.divide,
         state.fates.vanish,
-        state.fates.appear,
+        state.fates.appear_sized,
     )
     # What the edge cuts off is not known of masks either.
     whole: BoolArray = np.asarray(~state.movie.cut[cells].any(axis=1))
