@@ -164,6 +164,7 @@ def ablation() -> list[dict]:
                 runs[variant].append({"cpu_s": seconds, **row(scores)})
         for variant, found in runs.items():
             line: dict = {"set": name, "step": step, "variant": variant}
+            line["copies"] = len(found)
             line["cpu_s"] = float(np.mean([run["cpu_s"] for run in found]))
             for key in ("edge_f1", "division_f1", "idf1"):
                 values = np.array([run[key] for run in found], dtype=float)
@@ -480,9 +481,9 @@ TITLES = {
     "defaults only; the search range of the peers is the best of four (0.35 to 1 spacing) per set, "
     "chosen on the truth; wider ranges and a drift prediction lift LapTrack to 0.565 "
     "and trackpy to 0.747 at every 7th frame",
-    "ablation": "What each cue brings, and its CPU time: means over the eight ways to turn and "
-    "mirror each movie (gaps left open); 'lost' is what leaving the cue out costs on the same "
-    "copy, with the standard error of its mean",
+    "ablation": "What each cue brings, and its CPU time: means over turned and mirrored copies of "
+    "each movie (gaps left open); 'lost' is what leaving the cue out costs on the same copy, with "
+    "the standard error of its mean",
     "motion": "Edge F1 against root mean square step over cell diameter (crowded layers of 500 "
     "cells by their seed, no divisions; peers with the best of four search ranges on each layer)",
     "faults": "Edge F1 among intact cells when a share of the others is deleted, split or merged "
@@ -491,8 +492,8 @@ TITLES = {
     "bands (number in brackets). 'before': belief propagation without the heat of log odds, which "
     "was learned on part of these recordings and on synthetic layers with divisions, not on the "
     "two layers shown (where every division is false)",
-    "speed": "CPU seconds on one thread, median of three interleaved runs; 'centroids': cellquant "
-    "without masks; LapTrack on the centroids of the first movie (shown here: one run)",
+    "speed": "CPU seconds on one thread of a busy machine, median of three interleaved runs; "
+    "'centroids': cellquant without masks; LapTrack on the centroids of the first movie",
 }
 
 
