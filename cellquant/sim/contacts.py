@@ -236,7 +236,7 @@ class Layer:
                 self._modes,
             )
         fresh = self._reference is None
-        reference = self._record[:, [0, 1, 3]] if self._reference is None else self._reference
+        reference = self._record if self._reference is None else self._reference  # any, if fresh
         age, fault, narrowest = neighbours.inspect(self._record, reference)
         self._narrow = self._parted = NONE
         if (fault >= 0 or narrowest < 4.0 * pinches.SHARP) and not self.scene.rigid:

@@ -156,7 +156,7 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
             )  # fmt: skip
             # First the first crossing of every gap; those with two are then listed once more.
             n_listed = n_gaps
-            n_apart = 0
+            n_apart: Any = np.int64(0)
             for second in range(2):
                 judge_gaps(
                     depth, change, place, weight, mean, second * n_gaps,
@@ -285,8 +285,8 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                 s = rows[0, g] // 4
                 settle(
                     record, owner[k], other[begin + k], apart[k, 0], apart[k, 1],
-                    compass[0, s], compass[1, s], hints[2, g], hints[3, g], lines[1, g],
-                    hints[4, g], modes, roots, r,
+                    compass[0, s], compass[1, s], np.float64(hints[2, g]), np.float64(hints[3, g]),
+                    lines[1, g], np.float64(hints[4, g]), modes, roots, r,
                 )  # fmt: skip
             # Nearly every pair has two crossings; those are summed up side by side.
             n_twice = 0

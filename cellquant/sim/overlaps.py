@@ -231,7 +231,7 @@ def exact_velocity(
         end = min(n_cells, (block + 1) * BLOCK)
         for begin in range(block * BLOCK, end, QUAD):
             tile[:] = 0.0
-            used = 0
+            used: Any = np.int64(0)
             for column in range(QUAD):
                 i = min(begin + column, end - 1)
                 rows[column] = i * record.shape[1]
@@ -243,7 +243,7 @@ def exact_velocity(
                 fy = 0.0
                 spin = 0.0
                 whole = 0.0
-                filled = 0
+                filled: Any = np.int64(0)
                 arcs_r = 1.0
                 arcs_i = 0.0
                 n_own = first[i + 1] - first[i]
@@ -270,7 +270,7 @@ def exact_velocity(
                     arc_i = peek(lenses, at + 5 + 2 * side)
                     for r in range(begin_of_it, end_of_it):
                         if filled == SLOTS:
-                            add_powers(roots, places, SLOTS, modes, tile)
+                            add_powers(roots, places, filled, modes, tile)
                             filled = 0
                             used = 0
                         poke(places, filled * QUAD + column, ROOT * r + 4 * side)

@@ -163,7 +163,7 @@ def list_gaps(
     given), or else OUTSIDE where the first sample lies outside of j and INSIDE where it does not.
     """
     room = size + 5 * LANES
-    base = 0
+    base: Any = np.int64(0)  # a plain 0 would have callers compiled twice
     for pair in range(filled):
         count = int(counts[pair])
         if count == 0 or codes[pair] == CLOSELY:
@@ -215,4 +215,4 @@ def list_gaps(
         poke(rows, 3 * listed + g, stride * j)
     for g in range(base, base + 2 * LANES):
         place[g] = LANES  # what fills up the last vector
-    return base
+    return int(base)

@@ -53,6 +53,8 @@ def _keep_areas(modes: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
     near = np.flatnonzero(np.sqrt(np.sum(modes**2, axis=1)).sum(axis=1) >= mean)
     n_modes = modes.shape[2]
     record = np.zeros((len(near), record_length(n_modes)))
+    if len(near) == 0:  # as nearly always: then nothing need be compiled
+        return mean, near, record
     record[:, HEAD : HEAD + n_modes] = modes[near, 0]
     record[:, HEAD + n_modes : HEAD + 2 * n_modes] = -modes[near, 1]
     weights = np.empty((len(near), 2 * n_modes))
@@ -185,4 +187,6 @@ def _central(
 def _lobes(modes: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Pinched cells, and what `areas.measure` finds for them, with R0 = 1 and theta = 0."""
     _, cells, record = _keep_areas(modes)
+    if len(cells) == 0:
+        return cells, np.empty((0, 7))
     return cells, areas.measure(record, np.arange(len(cells)), modes.shape[2])
