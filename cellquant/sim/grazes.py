@@ -81,7 +81,7 @@ def turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     return cosine * c - sine * s, sine * c + cosine * s
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
 def settle(
     record: Any, i: int, j: int, dx: float, dy: float, cosine: float, sine: float,
     low: float, high: float, angle: float, sign: float, modes: Any, roots: Any, row: int,
@@ -222,7 +222,7 @@ def halve_gap(
     return n_found, looks
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def search_gap(
     record: Any, i: int, j: int, dx: float, dy: float, compass: Any, s: int, begin: float,
     end: float, modes: Any, stack: Any, found: Any, n_found: int,
@@ -252,7 +252,7 @@ def search_gap(
     return n_found
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def search_closely(
     record: Any, i: int, j: int, dx: float, dy: float, compass: Any, start: int, count: int,
     modes: Any, stack: Any, found: Any,
