@@ -159,7 +159,7 @@ def cost():
     found = in_turns({
         "exact": evaluation(Layer(scene, radius, box), state),
         "40 points": evaluation(Layer(scene, radius, box, contact="quadrature"), state),
-    })  # fmt: skip
+    }, rounds=400)  # fmt: skip
     return {
         "seconds": found,
         "ratio": found["exact"][0] / found["40 points"][0],
