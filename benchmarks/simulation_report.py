@@ -101,9 +101,11 @@ def main():
             f"{number(cost['ratio_of_least'])}): "
             f"{number(cost['cells_per_second'] / 1e6)} million cell evaluations per second, "
             f"{number(cost['cells_per_second_best'] / 1e6)} at best. "
-            "The aims are a ratio of 1 and one million. Arithmetic on the other core makes the "
-            "exact rule 1.5 times as slow and the sum 1.3 times: where a neighbour is busy, as it "
-            "was for a part of these turns, medians lie above the least.\n"
+            "The aims are a ratio of 1 and one million. The ratio hangs on the state of the machine: "
+            "three runs of this benchmark within an hour gave medians of 1.06, 1.06 (this one) and "
+            "1.11, and 1.02, 0.93 and 1.09 of the least. Arithmetic on the other core makes the "
+            "exact rule 1.5 times as slow and the sum 1.3 times; whether that explains the spread "
+            "is not known.\n"
         )
         if speed.get("threads"):
             parts.append(f"Two threads: {number(speed['threads']['speed_up'])} times faster.\n")
