@@ -101,9 +101,9 @@ def main():
             f"{number(cost['ratio_of_least'])}): "
             f"{number(cost['cells_per_second'] / 1e6)} million cell evaluations per second, "
             f"{number(cost['cells_per_second_best'] / 1e6)} at best. "
-            "The aims are a ratio of 1 and one million. The ratio hangs on the state of the machine: "
-            "three runs of this benchmark within an hour gave medians of 1.06, 1.06 (this one) and "
-            "1.11, and 1.02, 0.93 and 1.09 of the least. Arithmetic on the other core makes the "
+            "The aims are a ratio of 1 and one million. The ratio hangs on the state of the "
+            "machine: three runs of this benchmark on 26 November 2026 gave medians of 1.06, 1.06 "
+            "and 1.11, and 1.02, 0.93 and 1.09 of the least. Arithmetic on the other core made the "
             "exact rule 1.5 times as slow and the sum 1.3 times; whether that explains the spread "
             "is not known.\n"
         )
