@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cellquant.errors import InputError
+from cellquant.sim import evaluation
 from cellquant.sim.contacts import Layer
 from cellquant.sim.initial import initial_state
 from cellquant.sim.scene import Scene, SimulationFailure
@@ -307,6 +308,54 @@ def test_forces_depend_on_no_number_of_parts_and_on_nothing_left_in_work_arrays(
         in_parts = velocity(layer, state)
         monkeypatch.undo()
         assert np.array_equal(in_parts, alone)
+
+
+@pytest.fixture
+def reached(monkeypatch):
+    """How far every evaluation at one go came."""
+    outcomes = []
+    evaluate = evaluation.evaluate
+
+    def noted(*arguments):
+        outcomes.append(evaluate(*arguments))
+        return outcomes[-1]
+
+    monkeypatch.setattr(evaluation, "evaluate", noted)
+    return outcomes
+
+
+@pytest.mark.parametrize("contact", ["exact", "quadrature"])
+def test_what_is_done_at_one_go_equals_what_is_done_step_by_step(contact, reached):
+    """Bit for bit, also where the list has aged and where a contour is pinched."""
+    scene = Scene(phi=1.0, n_cells=100)
+    state, radius, box = lively(scene)
+    far = state.copy()
+    far[:, :2] += np.random.default_rng(3).normal(scale=0.3, size=(100, 2))
+    pinched = far.copy()
+    pinched[7, 3:], pinched[7, 3] = 0.0, 0.75
+    at_one_go, by_steps = (Layer(scene, radius, box, contact=contact) for _ in range(2))
+    for row in (state, state, far, far, pinched, far):
+        by_steps._at_one_go = ()
+        assert np.array_equal(velocity(at_one_go, row), velocity(by_steps, row))
+    everything, outlines = evaluation.ALL, evaluation.OUTLINES
+    assert reached == [everything, outlines, everything, outlines, everything]
+
+
+def test_more_crossings_than_there_was_room_for_are_found(reached):
+    scene = Scene(phi=1.0, n_cells=100)
+    state, radius, box = lively(scene)
+    circles = state.copy()
+    circles[:, 3:] = 0.0
+    layer = Layer(scene, radius, box)
+    expected = velocity(layer, state)
+    velocity(layer, circles)
+    _, first, _, begin, end, _ = layer.crossings
+    in_blocks = np.add.reduceat(end - begin, first[:-1:32])
+    layer._allocate_roots(in_blocks.max() + 2)
+    velocity(layer, circles)
+    reached.clear()
+    assert np.array_equal(velocity(layer, state), expected)
+    assert reached == [evaluation.NOTHING]
 
 
 @pytest.mark.parametrize("contact", ["exact", "quadrature"])

@@ -13,6 +13,7 @@ from cellquant.sim import (
     crossings,
     discs,
     energies,
+    evaluation,
     lanes,
     lenses,
     neighbours,
@@ -78,12 +79,12 @@ class Layer:
         self.points = points
         self.evaluations = 0
         self.builds = 0
-        n_cells, n_modes = len(self.radius), scene.modes - 1
+        n_cells = len(self.radius)
+        n_modes = self._n_modes = scene.modes - 1
         self.n_columns = 3 + 2 * n_modes
         self.skin = 0.2 * scene.mean_radius
-        self._modes = (0,) * n_modes
-        self._tension = (0,) if scene.has_tension or general else ()
-        self._torque = (0,) if scene.has_torque or general else ()
+        has_tension = scene.has_tension or general
+        self._features = n_modes, int(has_tension), int(scene.has_torque or general)
         self._numbers = np.array(
             [scene.v0, scene.k, scene.eta, scene.mu_r, scene.mu_theta, scene.mu_ab], np.float64
         )
@@ -107,7 +108,9 @@ class Layer:
         else:
             self._rho = lanes.zeros(n_cells, size)
             self._slope = lanes.zeros(n_cells, size)
-        self._addresses: dict[parts.Shared, int] = {}
+        self._outlines = outlines.contours if contact == "exact" else quadrature.sample_contours
+        self._bound: dict[parts.Shared, parts.Bound] = {}
+        self._at_one_go: tuple[tuple[int, int], ...] = ()
         self._reference: Floats | None = None
         self._capacity = 6 * n_cells + 64
         self._n_blocks = -(-n_cells // outlines.BLOCK)
@@ -132,43 +135,34 @@ class Layer:
             if array.dtype != np.float64 or not array.flags.c_contiguous:
                 raise ValueError("a state must be a C-contiguous array of float64")
         self.evaluations += 1
-        self._prepare(state, self._tension if self.contact == "exact" else ())
-        common = (self._first, self._other, self._shift)
-        back = (self._back_first, self._back_pair, self._back_cell)
+        self._n_parts = min(self._n_blocks, numba.get_num_threads())
+        reached = evaluation.NOTHING
+        if self._n_parts == 1 and self._at_one_go:
+            self._narrow = self._parted = NONE
+            reached = evaluation.evaluate(
+                self._at_one_go, state, out, self._record, self._reference, self._fault,
+                *self._limits,
+            )  # fmt: skip
+        if reached != evaluation.ALL:
+            self._evaluate(state, out, reached)
+
+    def _evaluate(self, state: Floats, out: Floats, reached: int) -> None:
+        """Take decisions between the kernels."""
+        self._prepare(state, out, reached)
         if self.scene.rigid:
-            self._share(
-                discs.rigid_velocity,
-                (state, self.radius, *common, *back, self._numbers, out),
-            )
+            self._do(discs.rigid_velocity, state, out)
         elif self.contact == "exact":
-            self._find_crossings()
-            self._share(
-                overlaps.exact_velocity,
-                (
-                    state, self.radius, self._record, self._tangent, self._first, self._other,
-                    *back, self._roots, self._root_first, self._root_last, self._lenses,
-                    self._inside, self._numbers, out, self._energy, self._growth,
-                ),
-                self._modes,
-                self._tension,
-                self._torque,
-            )  # fmt: skip
+            self._find_crossings(state, out)
+            self._do(overlaps.exact_velocity, state, out)
         else:
-            self._share(
-                quadrature.quadrature_velocity,
-                (
-                    state, self.radius, self._record, self._rho, self._slope, self._table,
-                    *common, *back, self._numbers, out, self._growth,
-                ),
-                self._modes,
-                self._tension,
-                self._torque,
-            )  # fmt: skip
+            self._do(quadrature.quadrature_velocity, state, out)
         if len(self._parted):
             areas.correct_velocity(
                 self._record, self._parted, self._pulls, self.radius, self._growth,
-                self.scene.mu_ab, len(self._modes), out,
+                self.scene.mu_ab, self._n_modes, out,
             )  # fmt: skip
+        if not (self._at_one_go or self.scene.rigid):
+            self._get_ready()
 
     def energies(self, state: Floats) -> Floats:
         """Energy of every cell: its tension and its share of the overlaps, by the exact rule."""
@@ -188,8 +182,7 @@ class Layer:
     def touching(self, state: Floats) -> NDArray[np.int64]:
         """Pairs (i, j) of cells that overlap by the exact rule, (pairs, 2), one row per image."""
         self.velocity(state, np.empty_like(state))
-        first_cell = np.repeat(np.arange(len(self.radius)), np.diff(self._first))
-        pairs = np.column_stack([first_cell, self._other])
+        pairs = np.column_stack([self._owner, self._other])
         if not self.scene.rigid:
             return pairs[(self._root_last > self._root_first) | (self._inside > 0)]
         apart = state[pairs[:, 1], :2] + self._shift - state[pairs[:, 0], :2]
@@ -214,27 +207,12 @@ class Layer:
         self._record[:, [0, 1, 3, 4]] = reference
         self._rebuild()
 
-    def _prepare(self, state: Floats, tension: tuple[int, ...]) -> None:
-        self._n_parts = min(self._n_blocks, numba.get_num_threads())
+    def _prepare(self, state: Floats, out: Floats, reached: int) -> None:
         if self.scene.rigid:
             self._record[:, :2] = state[:, :2]
             self._record[:, 2:5] = self.radius[:, None]
-        elif self.contact == "exact":
-            self._share(
-                outlines.contours,
-                (
-                    state, self.radius, self._single, self._quarter, self._starts, self._record,
-                    self._grid, self._pattern, self._tangent,
-                ),
-                self._modes,
-                tension,
-            )  # fmt: skip
-        else:
-            self._share(
-                quadrature.sample_contours,
-                (state, self.radius, self._table, self._record, self._rho, self._slope),
-                self._modes,
-            )
+        elif reached == evaluation.NOTHING:
+            self._do(self._outlines, state, out)
         fresh = self._reference is None
         reference = self._record if self._reference is None else self._reference  # any, if fresh
         age, fault, narrowest = neighbours.inspect(self._record, reference)
@@ -244,27 +222,71 @@ class Layer:
             age, fault, _ = neighbours.inspect(self._record, reference)
             self._narrow = np.flatnonzero(self._record[:, 4] < pinches.SHARP * self.radius)
         self._check(fault)
-        if len(self._narrow) and tension:
-            pinches.measure_lengths(self._record, self._narrow, len(self._modes), self._tangent)
+        if len(self._narrow) and self._features[1] and self.contact == "exact":
+            pinches.measure_lengths(self._record, self._narrow, self._n_modes, self._tangent)
         if fresh or age > 0.5 * self.skin:
             self._rebuild()
 
-    def _share(
-        self,
-        kernel: parts.Shared,
-        arrays: tuple[Any, ...],
-        modes: tuple[int, ...] = (),
-        tension: tuple[int, ...] = (),
-        torque: tuple[int, ...] = (),
-    ) -> None:
-        features = modes, tension, torque
-        if kernel not in self._addresses:
-            self._addresses[kernel] = kernel.address(arrays, *features)
-        address = self._addresses[kernel]
-        if self._n_parts == 1:
-            parts.alone(address, arrays, *features)
-        else:
-            parts.share(address, self._n_parts, arrays, *features)
+    def _do(self, kernel: parts.Shared, state: Floats, out: Floats) -> None:
+        bound = self._bound.get(kernel)
+        if bound is None:
+            bound = self._bound[kernel] = parts.Bound(kernel, *self._handed(kernel))
+        elif not bound.arrays:
+            bound.describe(self._handed(kernel)[0])
+        bound(self._n_parts, state, out)
+
+    def _get_ready(self) -> None:
+        """Note what the next evaluation does at one go, see `evaluation`."""
+        kernels = [self._outlines, quadrature.quadrature_velocity]
+        if self.contact == "exact":
+            kernels[1:] = [crossings.crossings, overlaps.exact_velocity]
+        bound = [self._bound[kernel] for kernel in kernels]
+        self._at_one_go = tuple((work.address, work.kept) for work in bound)
+        self._limits = 0.5 * self.skin, 4.0 * pinches.SHARP
+
+    def _forget(self) -> None:
+        """Arrays of pairs were made anew: no kernel knows where they are."""
+        self._at_one_go = ()
+        for kernel, bound in self._bound.items():
+            if kernel is not self._outlines:
+                bound.arrays = ()
+
+    def _handed(self, kernel: parts.Shared) -> tuple[tuple[Any, ...], tuple[int, int, int]]:
+        """What a kernel reads and writes, and the features it is compiled for."""
+        modes, tension, _ = self._features
+        if kernel is outlines.contours:
+            arrays: tuple[Any, ...] = (
+                self.radius, self._single, self._quarter, self._starts, self._record, self._grid,
+                self._pattern, self._tangent,
+            )  # fmt: skip
+            return arrays, (modes, tension, 0)
+        if kernel is quadrature.sample_contours:
+            arrays = self.radius, self._table, self._record, self._rho, self._slope
+            return arrays, (modes, 0, 0)
+        pairs = self._first, self._other, self._shift
+        back = self._back_first, self._back_pair, self._back_cell
+        if kernel is crossings.crossings:
+            arrays = (
+                self._record, self._grid, self._rim, self._pattern, self._circle, self._table,
+                self._first, self._owner, self._other, self._shift, self._roots[: self._room],
+                self._root_first, self._root_last, self._lenses, self._inside, self._fault,
+                *self._work,
+            )  # fmt: skip
+            return arrays, (modes, 0, 0)
+        if kernel is overlaps.exact_velocity:
+            arrays = (
+                self.radius, self._record, self._tangent, self._first, self._other, *back,
+                self._roots, self._root_first, self._root_last, self._lenses, self._inside,
+                self._numbers, self._energy, self._growth,
+            )  # fmt: skip
+            return arrays, self._features
+        if kernel is quadrature.quadrature_velocity:
+            arrays = (
+                self.radius, self._record, self._rho, self._slope, self._table, *pairs, *back,
+                self._numbers, self._growth,
+            )  # fmt: skip
+            return arrays, self._features
+        return (self.radius, *pairs, *back, self._numbers), (0, 0, 0)
 
     def _check(self, fault: int) -> None:
         if fault >= 0:
@@ -276,7 +298,7 @@ class Layer:
 
     def _keep_areas(self) -> None:
         """Mean radius, samples and bounds of contours with gaps, whose closed form differs."""
-        n_modes = len(self._modes)
+        n_modes = self._n_modes
         cells = np.flatnonzero(~(self._record[:, 4] >= PINCHED * self.radius))
         pulls = np.empty((len(cells), 2 * n_modes))
         parted = areas.keep_areas(self._record, self.radius, n_modes, cells, pulls)
@@ -297,7 +319,7 @@ class Layer:
         """Write a contour sampled anew to what the search of crossings reads."""
         row = self._grid.shape[2]
         self._grid[i] = np.resize(rho, row), np.resize(slope, row)
-        n_modes = len(self._modes)
+        n_modes = self._n_modes
         modes = self._record[i, records.HEAD : records.HEAD + 2 * n_modes]
         self._pattern[i, 0] = self._record[i, 2]
         self._pattern[i, 1 : 1 + 2 * n_modes] = modes
@@ -318,10 +340,14 @@ class Layer:
                     "the box is far too small for its cells: enlarge it",
                 )
             self._capacity = int(needed[0])
-        self._first, self._other, self._shift = first, other.copy(), shift.copy()
+        self._first, self._other = first, other.copy()
+        self._shift = lanes.zeros(len(other) + 1, 2)[:-1]  # two pairs are read at once
+        self._shift[:] = shift
         self._put_narrow_first()
+        self._owner = np.repeat(np.arange(len(reach)), np.diff(self._first))
         back = neighbours.transpose_pairs(self._first, self._other)
         self._back_first, self._back_pair, self._back_cell = back
+        self._forget()
         self._root_first = np.zeros(len(self._other), np.int64)
         self._root_last = np.zeros(len(self._other), np.int64)
         self._inside = np.zeros(len(self._other), np.int8)
@@ -341,7 +367,7 @@ class Layer:
         first, second = np.where(turned, (self._other, cell), (cell, self._other))
         order = np.argsort(first, kind="stable")
         self._other = second[order]
-        self._shift = (sign[:, None] * self._shift)[order]
+        self._shift[:] = (sign[:, None] * self._shift)[order]
         self._first = np.searchsorted(first[order], np.arange(len(waist) + 1))
 
     def _allocate_roots(self, room: int, spare: int = 0) -> None:
@@ -349,21 +375,14 @@ class Layer:
         # The last row stays zero: no crossing.
         self._roots = lanes.zeros(self._room + spare + 1, lenses.ROOT)
         self._fault = np.zeros(self._n_blocks, np.int64)
+        self._forget()
 
-    def _find_crossings(self) -> None:
+    def _find_crossings(self, state: Floats, out: Floats) -> None:
         while True:
             if len(self._work[0]) < self._n_parts:
                 self._work = crossings.work(self._n_parts, self._table.shape[1])
-            self._share(
-                crossings.crossings,
-                (
-                    self._record, self._grid, self._rim, self._pattern, self._circle,
-                    self._table, self._first, self._other, self._shift, self._roots[: self._room],
-                    self._root_first, self._root_last, self._lenses, self._inside, self._fault,
-                    *self._work,
-                ),
-                self._modes,
-            )  # fmt: skip
+                self._forget()
+            self._do(crossings.crossings, state, out)
             if self._fault.any():
                 self._allocate_roots(2 * self._room // self._n_blocks)
             elif (used := self._close_pinches()) >= len(self._roots):
@@ -378,18 +397,8 @@ class Layer:
         pinched = self._record[:, 4] < PINCHED * self.radius
         if not pinched.any():
             return 0
-        return int(
-            pinches.add_gaps(
-                self._record,
-                pinched,
-                self._first,
-                self._other,
-                self._roots[:-1],
-                self._root_first,
-                self._root_last,
-                self._lenses,
-                self._inside,
-                self._room,
-                len(self._modes),
-            )
-        )
+        used: int = pinches.add_gaps(
+            self._record, pinched, self._first, self._other, self._roots[:-1], self._root_first,
+            self._root_last, self._lenses, self._inside, self._room, self._n_modes,
+        )  # fmt: skip
+        return used

@@ -17,24 +17,23 @@ import numpy as np
 from numba import njit
 
 from cellquant.sim.grazes import FLAGS, gap, search_closely, search_gap, settle
-from cellquant.sim.lanes import LANES, peek, poke, zeros
+from cellquant.sim.lanes import LANES, bits, load, peek, poke, zeros
 from cellquant.sim.lenses import LENS, ROOT, sum_lens, sum_lenses
 from cellquant.sim.outlines import BLOCK
-from cellquant.sim.parts import shared
+from cellquant.sim.parts import features_of, shared, taken
 from cellquant.sim.polishing import TWO, UNSURE, judge_gaps, polish
 from cellquant.sim.sampling import (
     CLOSELY,
     FULL,
     INSIDE,
-    OUTSIDE,
     PAIRS,
     find_windows,
     list_gaps,
+    place_pairs,
     sample_pairs,
 )
 
-LISTED = 4 * FULL + 4 * LANES  # gaps, second crossings, and what to polish again
-NARROW = 0.1  # smallest radius over A0 for which single precision is trusted
+LISTED = 2 * FULL + 4 * LANES  # gaps and second crossings
 MOST_OF_A_GAP = 64  # crossings, where it is searched in double precision
 SETTLED = 2e-9  # error of an angle that needs no further steps
 OVERFLOW = 1  # more crossings than the buffer holds
@@ -46,9 +45,9 @@ def work(n_parts: int, size: int) -> tuple[Any, ...]:
         zeros(n_parts, 4, LISTED, kind=np.int64),
         zeros(n_parts, 2, LISTED, kind=np.int64),
         zeros(n_parts, 3, LISTED, kind=np.float32),
-        zeros(n_parts, 5, LISTED, kind=np.float32),
+        zeros(n_parts, 4, LISTED, kind=np.float32),
         zeros(n_parts, 13, LISTED, kind=np.float32),
-        zeros(n_parts, 13, LISTED),
+        zeros(n_parts, 15, LISTED),
         zeros(n_parts, 2, PAIRS * (size + 5 * LANES), kind=np.float32),
     )
 
@@ -63,12 +62,11 @@ def copy_gap(
     mean[to] = mean[source]
     for row in range(4):
         rows[row, to] = rows[row, source]
-    for row in range(5):
         hints[row, to] = hints[row, source]
 
 
 @shared(FLAGS)
-def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any) -> None:
+def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> None:
     """Find where the contours of every listed pair cross.
 
     `roots` has the same room for every block of cells; the crossings of pair p are the rows
@@ -76,10 +74,11 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
     lies in j, 2 where j lies in i. Every part has its own work arrays (see `work`).
     """
     (
-        record, grid, rim, pattern, circle, compass, first, other, shift, roots, root_first,
+        record, grid, rim, pattern, circle, compass, first, owners, other, shift, roots, root_first,
         root_last, lenses, inside, fault, gaps, places, weights, hints_of, pieces, lines_of,
         samples,
-    ) = arrays  # fmt: skip
+    ) = taken(kept)  # fmt: skip
+    modes, _, _ = features_of(kept)
     n_cells = record.shape[0]
     stride = record.shape[1]
     size = compass.shape[1]
@@ -90,7 +89,7 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
     apart = np.zeros((PAIRS, 4))
     start = np.empty(PAIRS, np.float32)
     count = np.empty(PAIRS, np.float32)
-    owner = np.empty(PAIRS, np.int64)
+    ends = np.zeros((3, PAIRS), np.int64)
     code = np.empty(PAIRS, np.int64)
     total = np.empty(PAIRS, np.int64)
     cursor = np.empty(PAIRS, np.int64)
@@ -116,34 +115,19 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
         n_roots = block * room
         full = n_roots + room - 1
         dump = full  # row for what is none
-        i = block * BLOCK
         last_pair = first[min(n_cells, (block + 1) * BLOCK)]
-        n_pairs = last_pair - first[i]
+        n_pairs = last_pair - first[block * BLOCK]
         n_batches = (n_pairs + PAIRS - 1) // PAIRS
         for batch in range(n_batches):
             begin = last_pair - n_pairs + batch * n_pairs // n_batches
             filled = last_pair - n_pairs + (batch + 1) * n_pairs // n_batches - begin
             for k in range(filled):
                 p = begin + k
-                while peek(first, i + 1) <= p:
-                    i += 1
-                row_i = i * stride
-                row_j = peek(other, p) * stride
-                dx = peek(record, row_j) + peek(shift, 2 * p) - peek(record, row_i)
-                dy = peek(record, row_j + 1) + peek(shift, 2 * p + 1) - peek(record, row_i + 1)
-                low = peek(record, row_i + 4)
-                poke(owner, k, i)
-                poke(apart, 4 * k, dx)
-                poke(apart, 4 * k + 1, dy)
-                poke(near, k, dx)
-                poke(near, PAIRS + k, dy)
-                poke(near, 2 * PAIRS + k, low)
-                poke(near, 3 * PAIRS + k, peek(record, row_i + 3))
-                poke(near, 4 * PAIRS + k, peek(record, row_j + 3))
-                narrow = low < NARROW * peek(record, row_i + 2)
-                narrow |= peek(record, row_j + 4) < NARROW * peek(record, row_j + 2)
-                poke(code, k, CLOSELY if narrow else OUTSIDE)
-                poke(total, k, 0)
+                poke(ends, k, peek(owners, p) * stride)
+                poke(ends, PAIRS + k, peek(other, p) * stride)
+                poke(ends, 2 * PAIRS + k, 2 * p)
+            place_pairs(record, shift, begin, filled, ends, near, apart, code)
+            owner = owners[begin : begin + filled]
             listed = other[begin : begin + filled]
             find_windows(near, start, count, filled, modes)
             sample_pairs(
@@ -152,7 +136,7 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
             )  # fmt: skip
             n_gaps = list_gaps(
                 pattern, owner, listed, start, count, filled, size, stride, depth, change,
-                place, weight, mean, rows, code,
+                place, weight, mean, rows, code, total,
             )  # fmt: skip
             # First the first crossing of every gap; those with two are then listed once more.
             n_listed = n_gaps
@@ -164,28 +148,31 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                 )  # fmt: skip
                 if second:
                     break
-                for g in range(n_gaps):
-                    number = int(peek(kind, g))
-                    k = peek(rows, LISTED + g) >> 2
-                    if number >= UNSURE and code[k] != CLOSELY:
-                        after = -1
-                        if number == UNSURE and n_apart + MOST_OF_A_GAP <= brackets.shape[0]:
-                            after = search_gap(
-                                record, owner[k], listed[k], apart[k, 0], apart[k, 1], compass,
-                                rows[0, g] >> 2, depth[place[g]], depth[place[g] + 1], modes,
-                                stack, brackets, n_apart,
-                            )  # fmt: skip
-                        if after < 0:
-                            code[k] = CLOSELY
-                        else:
-                            pair_of[n_apart:after] = k
-                            number = after - n_apart
-                            n_apart = after
-                            kind[g] = 0.0
-                    poke(total, k, peek(total, k) + number)
-                    if number == TWO and kind[g] > 0.0:
-                        copy_gap(g, n_listed, place, weight, mean, rows, hints)
-                        n_listed += 1
+                for begin_of_it in range(0, n_gaps, LANES):
+                    if bits(load(kind, begin_of_it) != 1.0) == np.uint64(0):
+                        continue  # the commonest case is counted already
+                    for g in range(begin_of_it, min(begin_of_it + LANES, n_gaps)):
+                        number = int(peek(kind, g))
+                        k = peek(rows, LISTED + g) >> 2
+                        if number >= UNSURE and code[k] != CLOSELY:
+                            after = -1
+                            if number == UNSURE and n_apart + MOST_OF_A_GAP <= brackets.shape[0]:
+                                after = search_gap(
+                                    record, owner[k], listed[k], apart[k, 0], apart[k, 1],
+                                    compass, rows[0, g] >> 2, depth[place[g]],
+                                    depth[place[g] + 1], modes, stack, brackets, n_apart,
+                                )  # fmt: skip
+                            if after < 0:
+                                code[k] = CLOSELY
+                            else:
+                                pair_of[n_apart:after] = k
+                                number = after - n_apart
+                                n_apart = after
+                                kind[g] = 0.0
+                        poke(total, k, peek(total, k) + number - 1)
+                        if number == TWO and kind[g] > 0.0:
+                            copy_gap(g, n_listed, place, weight, mean, rows, hints)
+                            n_listed += 1
                 for g in range(n_listed, n_listed + 2 * LANES):
                     place[g] = LANES
             for k in range(filled):
@@ -256,37 +243,22 @@ def crossings(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, to
                 if number == TWO:
                     poke(target, partner, ROOT * (dump if dead else r + 1))
                     partner += 1
-            # What one step does not settle takes a second one, then safeguarded ones.
-            again = n_listed
-            for attempt in range(2):
-                ending = again if attempt else n_listed
-                for g in range(ending, ending + (attempt * n_listed - ending) % LANES):
-                    copy_gap(ending - 1, g, place, weight, mean, rows, hints)
-                    target[g] = ROOT * dump
-                polish(
-                    attempt * n_listed, ending, circle, apart, record, rows, hints, modes,
-                    scratch, lines, target, roots,
-                )  # fmt: skip
-                if attempt == 1:
-                    break
-                for g in range(n_listed):
-                    if not peek(lines, g) < SETTLED and target[g] != ROOT * dump:
-                        copy_gap(g, again, place, weight, mean, rows, hints)
-                        target[again] = target[g]
-                        moved = lines[1, g]
-                        if hints[2, g] < moved < hints[3, g]:
-                            hints[0, again] = moved
-                        again += 1
-            for g in range(n_listed, again):
-                if lines[0, g] < SETTLED:
+            for g in range(n_listed, (n_listed + LANES - 1) // LANES * LANES):
+                copy_gap(n_listed - 1, g, place, weight, mean, rows, hints)
+                target[g] = ROOT * dump
+            polish(
+                circle, apart, record, rows, hints, n_listed, modes, scratch, lines, target, roots
+            )  # fmt: skip
+            # What one step does not settle takes safeguarded ones.
+            for g in range(n_listed):
+                if peek(lines, g) < SETTLED or peek(target, g) == ROOT * dump:
                     continue
-                r = target[g] // ROOT
                 k = rows[1, g] // 4
                 s = rows[0, g] // 4
                 settle(
-                    record, owner[k], other[begin + k], apart[k, 0], apart[k, 1],
-                    compass[0, s], compass[1, s], np.float64(hints[2, g]), np.float64(hints[3, g]),
-                    lines[1, g], np.float64(hints[4, g]), modes, roots, r,
+                    record, owner[k], listed[k], apart[k, 0], apart[k, 1], compass[0, s],
+                    compass[1, s], np.float64(hints[1, g]), np.float64(hints[2, g]), lines[1, g],
+                    np.float64(hints[3, g]), modes, roots, target[g] // ROOT,
                 )  # fmt: skip
             # Nearly every pair has two crossings; those are summed up side by side.
             n_twice = 0

@@ -3,19 +3,15 @@
 import math
 from typing import Any
 
-from cellquant.sim.parts import shared
+from cellquant.sim.parts import shared, taken
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 
 
 @shared(FLAGS)
-def rigid_velocity(
-    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
-) -> None:
+def rigid_velocity(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> None:
     """Velocity of rigid discs: the chord of two circles is known in closed form."""
-    (
-        state, radius, first, other, shift, back_first, back_pair, back_cell, numbers, velocity,
-    ) = arrays  # fmt: skip
+    radius, first, other, shift, back_first, back_pair, back_cell, numbers = taken(kept)
     n_cells = state.shape[0]
     v0, k, mu_r = numbers[0], numbers[1], numbers[3]
     for i in range(part * n_cells // n_parts, (part + 1) * n_cells // n_parts):

@@ -176,16 +176,20 @@ def _loader(pair: bool) -> Any:
 
 
 def _store(_: Any, array: Any, at: Any, vector: Any) -> Any:
-    """Put a vector at a flat index of an array."""
+    """Put a vector at a flat index of an array, doubles also in single precision."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         place = _pointer(context, builder, signature.args[0], args[0], args[1])
-        size = NATIVE[vector.kind].get_abi_size(context.target_data)
-        place = builder.bitcast(place, args[2].type.as_pointer())
-        builder.store(args[2], place, align=size)
+        size = NATIVE[array.dtype].get_abi_size(context.target_data)
+        value = args[2]
+        if array.dtype != vector.kind:
+            value = builder.fptrunc(value, ir.VectorType(NATIVE[array.dtype], vector.lanes))
+        builder.store(value, builder.bitcast(place, value.type.as_pointer()), align=size)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, vector), generate
+    kinds = array.dtype, vector.kind
+    known = kinds[0] == kinds[1] or kinds == (types.float32, types.float64)
+    return types.void(array, types.intp, vector) if known else None, generate
 
 
 def _peek(_: Any, array: Any, at: Any) -> Any:

@@ -30,7 +30,7 @@ from cellquant.sim.lanes import (
     singles,
     store,
 )
-from cellquant.sim.parts import shared
+from cellquant.sim.parts import features_of, shared, taken
 from cellquant.sim.records import HEAD, write_records
 
 GUESS = 0x5FE6EB50C7B537A9  # bits from which those of 1 / sqrt follow, to 3 %
@@ -322,7 +322,7 @@ def sample(
 
 
 @shared(FLAGS)
-def contours(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any) -> None:
+def contours(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> None:
     """Record every contour and its samples; with tension also the gradient of its length.
 
     Writes `record`, samples of rho and its slope in `grid` (N, 2, see `row_of_samples`) and in
@@ -331,7 +331,8 @@ def contours(part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, tor
     L_n = integral (u + i n v) exp(i n phi), u = rho / |t|, v = slope / |t|. The lower estimate of
     rho is NaN where A0 is, see `areas`.
     """
-    state, radius, compass, quarter, starts, record, grid, pattern, tangent = arrays
+    radius, compass, quarter, starts, record, grid, pattern, tangent = taken(kept)
+    modes, tension, _ = features_of(kept)
     n_modes = len(modes)
     n_cells = state.shape[0]
     size = compass.shape[1]

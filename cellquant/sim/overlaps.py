@@ -15,7 +15,7 @@ from cellquant.sim.grazes import gap
 from cellquant.sim.lanes import QUAD, doubles, gather, load, peek, poke, root, store
 from cellquant.sim.lenses import LENS, ROOT
 from cellquant.sim.outlines import BLOCK
-from cellquant.sim.parts import shared
+from cellquant.sim.parts import features_of, shared, taken
 from cellquant.sim.records import HEAD
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
@@ -198,9 +198,7 @@ def shape_forces(
 
 
 @shared(FLAGS)
-def exact_velocity(
-    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
-) -> None:
+def exact_velocity(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> None:
     """Generalised velocity, energy and dH/dA0 of every cell from the crossings of its contour.
 
     The energy lacks the areas of the lenses, see `energies`.
@@ -208,9 +206,10 @@ def exact_velocity(
     `numbers` holds v0, k, eta, mu_r, mu_theta, mu_ab.
     """
     (
-        state, radius, record, tangent, first, second, back_first, back_pair, back_cell, roots,
-        root_first, root_last, lenses, inside, numbers, velocity, energy, growth,
-    ) = arrays  # fmt: skip
+        radius, record, tangent, first, second, back_first, back_pair, back_cell, roots,
+        root_first, root_last, lenses, inside, numbers, energy, growth,
+    ) = taken(kept)  # fmt: skip
+    modes, tension, torque = features_of(kept)
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
     n_cells = state.shape[0]

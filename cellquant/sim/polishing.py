@@ -1,7 +1,7 @@
 """Crossings from the gaps between samples: how many there are, where, and at last to round-off.
 
 In a gap the depth is interpolated in single precision. One evaluation of both contours in double
-precision and a step of order three then settle nearly every crossing.
+precision, with two derivatives, and a step of order three then settle nearly every crossing.
 """
 
 from typing import Any
@@ -175,7 +175,7 @@ def judge_gaps(
             high = pick(change_3, one, pick(change_2, t2, t1))
             begin_of_it = pick(change_1, t1, t2)
             end_of_it = singles_pair(1.0 + BEYOND)
-            store(hints, 4 * room + g, pick(g0, one, -one))
+            store(hints, 3 * room + g, pick(g0, one, -one))
         else:
             # The first piece between extrema that crosses zero, or else the last one.
             hidden = pick(ROUGH * a0 - bent, singles_pair(HIDDEN), singles_pair(UNSURE))
@@ -183,10 +183,10 @@ def judge_gaps(
             low = pick(change_1, none, pick(change_2, t1, t2))
             high = pick(change_1, t1, pick(change_2, t2, one))
             begin_of_it = singles_pair(-BEYOND)
-            store(hints, 4 * room + g, pick(g0, -one, one))
+            store(hints, 3 * room + g, pick(g0, -one, one))
             end_of_it = choose(number == TWO, pick(change_1, t1, t2), 1.0 + BEYOND)
-        store(hints, 2 * room + g, begin_of_it * spacing)
-        store(hints, 3 * room + g, end_of_it * spacing)
+        store(hints, room + g, begin_of_it * spacing)
+        store(hints, 2 * room + g, end_of_it * spacing)
         # From an extremum, of height p2 at t2 and else p1, the parabola through it leads close.
         turning = choose(low > 0.0, low, high)
         value = choose(turning == t2, p2, p1)
@@ -205,25 +205,22 @@ def judge_gaps(
     for g in range(begin, end, 2 * LANES):
         t = load_pair(piece, 12 * room + g)
         t = greatest(least(t, load_pair(piece, 11 * room + g)), load_pair(piece, 10 * room + g))
-        bend = 2.0 * load_pair(piece, 2 * room + g) + 6.0 * load_pair(piece, 3 * room + g) * t
         store(hints, g, t * spacing)
-        store(hints, room + g, bend / (spacing * spacing))
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def radii(
-    record: Any, rows: Any, row: int, begin: int, end: int, modes: Any, scratch: Any, lines: Any,
-    column: int,
+    record: Any, rows: Any, row: int, count: int, modes: Any, scratch: Any, lines: Any, column: int,
 ) -> None:  # fmt: skip
-    """Radius and slope of a contour for every listed direction, to round-off.
+    """Radius of a contour and two derivatives for every listed direction, to round-off.
 
-    Rows `column` and `column` + 1 of `lines` hold the directions, the next two take the answers.
+    Rows `column` and `column` + 1 of `lines` hold the directions, the next three take the answers.
     """
     n_modes = len(modes)
     top = n_modes - 1
     room = rows.shape[1]
     imaginary = n_modes * LANES
-    for r in range(begin, end, LANES):
+    for r in range(0, count, LANES):
         c = load_pair(lines, column * room + r)
         s = load_pair(lines, (column + 1) * room + r)
         for m in range(0, 2 * n_modes + 1, 4):
@@ -236,34 +233,42 @@ def radii(
         pi = load_pair(scratch, imaginary + top * LANES)
         qr = doubles_pair(0.0)
         qi = doubles_pair(0.0)
+        hr = doubles_pair(0.0)
+        hi = doubles_pair(0.0)
         for k in range(1, n_modes):
             cr = load_pair(scratch, (top - k) * LANES)
             ci = load_pair(scratch, imaginary + (top - k) * LANES)
+            hr, hi = hr * c + (qr - hi * s), hr * s + (qi + hi * c)
             qr, qi = qr * c + (pr - qi * s), qr * s + (pi + qi * c)
             pr, pi = pr * c + (cr - pi * s), pr * s + (ci + pi * c)
-        # With p(z) = sum C_n z^(n - 2) and q = dp/dz the slope is Re i (2 z^2 p + z^3 q).
+        # With p(z) = sum C_n z^(n - 2), q = dp/dz and 2 h = dq/dz the slope is
+        # Re i (2 z^2 p + z^3 q) and its derivative -Re (4 z^2 p + 5 z^3 q + 2 z^4 h).
+        hr, hi = 5.0 * qr + 2.0 * (hr * c - hi * s), 5.0 * qi + 2.0 * (hr * s + hi * c)
+        hr, hi = hr * c + (4.0 * pr - hi * s), hr * s + (4.0 * pi + hi * c)
         qr, qi = qr * c + (2.0 * pr - qi * s), qr * s + (2.0 * pi + qi * c)
         zr = c * c - s * s
         zi = 2.0 * c * s
         mean = load_pair(scratch, 2 * imaginary)
         store(lines, (column + 2) * room + r, pr * zr + (mean - pi * zi))
         store(lines, (column + 3) * room + r, -(qr * zi + qi * zr))
+        store(lines, (column + 4) * room + r, hi * zi - hr * zr)
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def polish(
-    begin: int, end: int, circle: Any, apart: Any, record: Any, rows: Any, hints: Any,
-    modes: Any, scratch: Any, lines: Any, target: Any, roots: Any,
+    circle: Any, apart: Any, record: Any, rows: Any, hints: Any, count: int, modes: Any,
+    scratch: Any, lines: Any, target: Any, roots: Any,
 ) -> None:  # fmt: skip
     """Step of order three on the crossing in every listed gap, then its data.
 
     Rows of `rows`: where the numbers of its sample, its pair, i and j begin. Rows of `hints`: angle
-    from the sample, second derivative of the depth, the bracket and the sign. `target` says where
-    in `roots` the row of each root begins; row 0 of `lines` takes its error, row 1 the angle. Each
-    pass is short, so that operations seldom wait for each other.
+    from the sample, the bracket and the sign. `target` says where in `roots` the row of each root
+    begins; row 0 of `lines` takes its error, row 1 the angle. Each pass is short, so that
+    operations seldom wait for each other.
     """
     room = rows.shape[1]
-    for r in range(begin, end, LANES):
+    jerk = 1.0 * (len(modes) + 1) ** 2  # a sixth of the third derivative of rho over A0, and more
+    for r in range(0, count, LANES):
         c, s, _, _ = gather_pair(circle, rows, r, 0)
         angle = widen_pair(hints, r)
         q = angle * angle
@@ -280,55 +285,68 @@ def polish(
         store(lines, room + r, s * cosine + c * sine)
     for side in range(2):
         if side == 1:
-            for r in range(begin, end, LANES):
+            for r in range(0, count, LANES):
                 c = load_pair(lines, r)
                 s = load_pair(lines, room + r)
                 rho = load_pair(lines, 2 * room + r)
                 slope = load_pair(lines, 3 * room + r)
+                curve = load_pair(lines, 4 * room + r)
                 dx, dy, _, _ = gather_pair(apart, rows, room + r, 0)
                 x = rho * c - dx
                 y = rho * s - dy
                 tx = slope * c - rho * s
                 ty = slope * s + rho * c
+                nx = curve * c - slope * s - ty
+                ny = curve * s + slope * c + tx
                 square = x * x + y * y
                 inverse = 1.0 / root(square)
                 ux = x * inverse
                 uy = y * inverse
-                store(lines, 4 * room + r, ux)
-                store(lines, 5 * room + r, uy)
-                store(lines, 8 * room + r, square * inverse)
-                store(lines, 9 * room + r, (ux * ty - uy * tx) * inverse)
-                store(lines, 10 * room + r, ux * tx + uy * ty)
-                store(lines, 11 * room + r, dx)
-                store(lines, 12 * room + r, dy)
-        radii(record, rows, 2 + side, begin, end, modes, scratch, lines, 4 * side)
-    for r in range(begin, end, LANES):
-        depth = load_pair(lines, 6 * room + r) - load_pair(lines, 8 * room + r)
-        across = load_pair(lines, 7 * room + r) * load_pair(lines, 9 * room + r)
-        rate = 1.0 / (across - load_pair(lines, 10 * room + r))
+                # Derivatives of the distance to j, and of the direction as seen from j.
+                away = ux * tx + uy * ty
+                turn = (ux * ty - uy * tx) * inverse
+                distance = square * inverse
+                store(lines, 5 * room + r, ux)
+                store(lines, 6 * room + r, uy)
+                store(lines, 10 * room + r, distance)
+                store(lines, 11 * room + r, away)
+                store(lines, 12 * room + r, turn)
+                store(lines, 13 * room + r, (ux * nx + uy * ny) + distance * (turn * turn))
+                store(lines, 14 * room + r, ((ux * ny - uy * nx) - 2.0 * away * turn) * inverse)
+        radii(record, rows, 2 + side, count, modes, scratch, lines, 5 * side)
+    for r in range(0, count, LANES):
+        depth = load_pair(lines, 7 * room + r) - load_pair(lines, 10 * room + r)
+        turn = load_pair(lines, 12 * room + r)
+        slope_j = load_pair(lines, 8 * room + r)
+        rate = 1.0 / (slope_j * turn - load_pair(lines, 11 * room + r))
         newton = -depth * rate
-        # Half the second derivative over the first bends the step; see the estimated error.
-        second = -0.5 * widen_pair(hints, room + r) * rate * newton
+        curve = load_pair(lines, 9 * room + r) * (turn * turn) - load_pair(lines, 13 * room + r)
+        curve += slope_j * load_pair(lines, 14 * room + r)
+        # Half the second derivative over the first bends the step.
+        second = -0.5 * curve * rate * newton
         step = newton * (1.0 + second)
         q = step * step
         sine = step * (1.0 - q * (1 / 6))
         cosine = 1.0 - 0.5 * q
         c = load_pair(lines, r)
         s = load_pair(lines, room + r)
-        rho = load_pair(lines, 2 * room + r) + step * load_pair(lines, 3 * room + r)
+        rho = load_pair(lines, 3 * room + r) + 0.5 * step * load_pair(lines, 4 * room + r)
+        rho = load_pair(lines, 2 * room + r) + step * rho
         c, s = c * cosine - s * sine, s * cosine + c * sine
-        x = rho * c - load_pair(lines, 11 * room + r)
-        y = rho * s - load_pair(lines, 12 * room + r)
+        dx, dy, _, _ = gather_pair(apart, rows, room + r, 0)
+        x = rho * c - dx
+        y = rho * s - dy
         square = x * x + y * y
         inverse = 1.0 / root(square)
         moved = widen_pair(hints, r) + step
-        inside = (moved > widen_pair(hints, 2 * room + r)) & (
-            moved < widen_pair(hints, 3 * room + r)
+        inside = (moved > widen_pair(hints, room + r)) & (
+            moved < widen_pair(hints, 2 * room + r)
         )
-        error = newton * newton + 0.02 * absolute(newton * second)
+        # What is left out is of order three: of the step, and of the radius there.
+        error = absolute(newton) * (jerk * newton * newton + 2.0 * second * second)
         error = choose(inside, error, 1.0)
         store(lines, r, error)
         store(lines, room + r, moved)
-        sign = widen_pair(hints, 4 * room + r)
+        sign = widen_pair(hints, 3 * room + r)
         scatter_rows(roots, target, r, 0, c, s, sign, rho)
         scatter_rows(roots, target, r, 4, x * inverse, y * inverse, -sign, square * inverse)

@@ -8,7 +8,7 @@ from numba import njit
 
 from cellquant.sim.lanes import LANES
 from cellquant.sim.outlines import BLOCK
-from cellquant.sim.parts import shared
+from cellquant.sim.parts import features_of, shared, taken
 from cellquant.sim.records import HEAD
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}
@@ -47,15 +47,14 @@ def facing(
 
 
 @shared(FLAGS)
-def sample_contours(
-    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
-) -> None:
+def sample_contours(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> None:
     """Record every contour and its samples.
 
     `table` holds cos(n phi_s) in row 2(n - 1) and sin(n phi_s) in row 2(n - 1) + 1, n = 1 .. M.
     Writes `record` (see `outlines`), the samples `rho` and `slope` = d rho / d phi.
     """
-    state, radius, table, record, rho, slope = arrays
+    radius, table, record, rho, slope = taken(kept)
+    modes, _, _ = features_of(kept)
     n_cells = state.shape[0]
     size = table.shape[1]
     half = size // 2
@@ -122,18 +121,17 @@ def sample_contours(
 
 
 @shared(FLAGS)
-def quadrature_velocity(
-    part: int, n_parts: int, arrays: Any, modes: Any, tension: Any, torque: Any
-) -> None:
+def quadrature_velocity(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> None:
     """Generalised velocity by the published rule: sums over the contour points inside a neighbour.
 
     The points stand at fixed directions phi_s = 2 pi s / K. Only how many neighbours hold a point
     matters, so the neighbours are counted first and every sum is taken once.
     """
     (
-        state, radius, record, rho, slope, table, first, other, shift, back_first, back_pair,
-        back_cell, numbers, velocity, growth,
-    ) = arrays  # fmt: skip
+        radius, record, rho, slope, table, first, other, shift, back_first, back_pair, back_cell,
+        numbers, growth,
+    ) = taken(kept)  # fmt: skip
+    modes, tension, torque = features_of(kept)
     v0, k, eta = numbers[0], numbers[1], numbers[2]
     mu_r, mu_theta, mu_ab = numbers[3], numbers[4], numbers[5]
     n_cells = state.shape[0]

@@ -18,7 +18,9 @@ from cellquant.sim.lanes import (
     ceiling,
     choose,
     count_ones,
+    doubles_pair,
     floor,
+    gather_pair,
     greatest,
     least,
     load,
@@ -27,6 +29,7 @@ from cellquant.sim.lanes import (
     poke,
     root,
     rough_root,
+    scatter,
     singles,
     store,
     trailing_zeros,
@@ -36,6 +39,7 @@ PAIRS = 112  # pairs whose contours are sampled before the gaps between samples 
 MANY = 12  # gaps of one pair that may hold a crossing; with more it is searched in double precision
 FULL = 4 * PAIRS  # gaps of all of them; pairs for which there is no room are searched in it too
 CLOSELY, OUTSIDE, INSIDE = -1, -2, -3  # what a pair without gaps is
+NARROW = 0.1  # smallest radius over A0 for which single precision is trusted
 FAST = 3.0  # turns round the centre of j per turn of i, above which modes of j are undersampled
 END = np.uint64(1 << 63)
 TINY = 1e-30
@@ -47,6 +51,41 @@ def arc_cosine(x: Any) -> Any:
     y = least(absolute(x), 1.0)
     half = root(1.0 - y) * (1.5707288 + y * (-0.2121144 + y * (0.0742610 + y * -0.0187293)))
     return choose(x >= 0.0, half, math.pi - half)
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
+def place_pairs(
+    record: Any, shift: Any, begin: int, filled: int, rows: Any, near: Any, apart: Any,
+    codes: Any,
+) -> None:  # fmt: skip
+    """Where the cells of many pairs lie: `near` (see `find_windows`), and in `apart` as doubles.
+
+    Rows of `rows`: where the records of i and of j begin, and the numbers of the pairs' shifts.
+    `codes` takes CLOSELY where a contour is narrow.
+    """
+    room = rows.shape[1]
+    nothing = doubles_pair(0.0)
+    for k in range(filled):
+        codes[k] = OUTSIDE
+    for k in range(0, filled, LANES):
+        x_i, y_i, mean_i, high_i = gather_pair(record, rows, k, 0)
+        low_i, _, _, _ = gather_pair(record, rows, k, 4)
+        x_j, y_j, mean_j, high_j = gather_pair(record, rows, room + k, 0)
+        low_j, _, _, _ = gather_pair(record, rows, room + k, 4)
+        shift_x, shift_y, _, _ = gather_pair(shift, rows, 2 * room + k, 0)
+        dx = (x_j + shift_x) - x_i
+        dy = (y_j + shift_y) - y_i
+        scatter(apart, 4 * k, 4, dx, dy, nothing, nothing)
+        store(near, k, dx)
+        store(near, PAIRS + k, dy)
+        store(near, 2 * PAIRS + k, low_i)
+        store(near, 3 * PAIRS + k, high_i)
+        store(near, 4 * PAIRS + k, high_j)
+        word = bits((low_i < NARROW * mean_i) | (low_j < NARROW * mean_j))
+        if word != np.uint64(0):
+            for lane in range(LANES):
+                if (word >> np.uint64(lane)) & np.uint64(1) and k + lane < filled:
+                    codes[k + lane] = CLOSELY
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
@@ -153,12 +192,13 @@ def sample_pairs(
 def list_gaps(
     pattern: Any, owner: Any, other: Any, starts: Any, counts: Any, filled: int, size: int,
     stride: int, depth: Any, change: Any, place: Any, weight: Any, mean: Any, rows: Any,
-    codes: Any,
+    codes: Any, numbers: Any,
 ) -> int:  # fmt: skip
     """List the gaps between samples that may hold a crossing; return their number.
 
     Of each gap `place` takes the index of the sample before it, `weight` 0 where there is no
     sample before or after the gap (else 1), and `mean` the A0 of j; for `rows` see `polish`.
+    `numbers` takes how many there are of every pair, and
     `codes` takes CLOSELY where a pair must be searched in double precision (also where that is
     given), or else OUTSIDE where the first sample lies outside of j and INSIDE where it does not.
     """
@@ -166,6 +206,7 @@ def list_gaps(
     base: Any = np.int64(0)  # a plain 0 would have callers compiled twice
     for pair in range(filled):
         count = int(counts[pair])
+        poke(numbers, pair, 0)
         if count == 0 or codes[pair] == CLOSELY:
             continue
         row = pair * room + LANES
@@ -195,6 +236,7 @@ def list_gaps(
                     poke(place, g + q, (pair << 16) + s + trailing_zeros(word | END))
                     word &= word - np.uint64(1)
             base += number
+        poke(numbers, pair, base - first)
     long = pattern.shape[1]
     listed = rows.shape[1]
     for g in range(base):
