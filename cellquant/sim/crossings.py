@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from cellquant.sim.grazes import FLAGS, gap, search_closely, search_gap, settle
-from cellquant.sim.lanes import LANES, bits, load, peek, poke, zeros
+from cellquant.sim.lanes import LANES, bits, load, load_pair, peek, poke, zeros
 from cellquant.sim.lenses import LENS, ROOT, sum_lens, sum_lenses
 from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import features_of, shared, taken
@@ -36,6 +36,7 @@ from cellquant.sim.sampling import (
 LISTED = 2 * FULL + 4 * LANES  # gaps and second crossings
 MOST_OF_A_GAP = 64  # crossings, where it is searched in double precision
 SETTLED = 2e-9  # error of an angle that needs no further steps
+EVERY = np.uint64((1 << LANES) - 1)  # lanes of a mask
 OVERFLOW = 1  # more crossings than the buffer holds
 
 
@@ -47,7 +48,7 @@ def work(n_parts: int, size: int) -> tuple[Any, ...]:
         zeros(n_parts, 3, LISTED, kind=np.float32),
         zeros(n_parts, 4, LISTED, kind=np.float32),
         zeros(n_parts, 13, LISTED, kind=np.float32),
-        zeros(n_parts, 15, LISTED),
+        zeros(n_parts, 17, LISTED),
         zeros(n_parts, 2, PAIRS * (size + 5 * LANES), kind=np.float32),
     )
 
@@ -177,10 +178,16 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
                     place[g] = LANES
             for k in range(filled):
                 p = begin + k
+                number = peek(total, k)
+                poke(root_first, p, n_roots)
+                poke(inside, p, 0)
+                if number > 0 and peek(code, k) != CLOSELY and n_roots + number <= full:
+                    poke(cursor, k, n_roots)
+                    n_roots += number
+                    poke(root_last, p, n_roots)
+                    continue
                 n_samples = int(count[k])
-                root_first[p] = n_roots
-                inside[p] = 0
-                empty = total[k] == 0
+                empty = number == 0
                 within = code[k] == INSIDE
                 if n_samples > 0 and code[k] == CLOSELY:
                     n_found = search_closely(
@@ -250,16 +257,19 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
                 circle, apart, record, rows, hints, n_listed, modes, scratch, lines, target, roots
             )  # fmt: skip
             # What one step does not settle takes safeguarded ones.
-            for g in range(n_listed):
-                if peek(lines, g) < SETTLED or peek(target, g) == ROOT * dump:
+            for begin_of_it in range(0, n_listed, LANES):
+                if bits(load_pair(lines, begin_of_it) < SETTLED) == EVERY:
                     continue
-                k = rows[1, g] // 4
-                s = rows[0, g] // 4
-                settle(
-                    record, owner[k], listed[k], apart[k, 0], apart[k, 1], compass[0, s],
-                    compass[1, s], np.float64(hints[1, g]), np.float64(hints[2, g]), lines[1, g],
-                    np.float64(hints[3, g]), modes, roots, target[g] // ROOT,
-                )  # fmt: skip
+                for g in range(begin_of_it, min(begin_of_it + LANES, n_listed)):
+                    if lines[0, g] < SETTLED or target[g] == ROOT * dump:
+                        continue
+                    k = rows[1, g] // 4
+                    s = rows[0, g] // 4
+                    settle(
+                        record, owner[k], listed[k], apart[k, 0], apart[k, 1], compass[0, s],
+                        compass[1, s], np.float64(hints[1, g]), np.float64(hints[2, g]),
+                        lines[1, g], np.float64(hints[3, g]), modes, roots, target[g] // ROOT,
+                    )  # fmt: skip
             # Nearly every pair has two crossings; those are summed up side by side.
             n_twice = 0
             for k in range(filled):

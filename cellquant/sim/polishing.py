@@ -272,15 +272,11 @@ def polish(
         c, s, _, _ = gather_pair(circle, rows, r, 0)
         angle = widen_pair(hints, r)
         q = angle * angle
-        sine = angle * (
-            1.0
-            + q
-            * (-1 / 6 + q * (1 / 120 + q * (-1 / 5040 + q * (1 / 362880 + q * (-1 / 39916800)))))
-        )
-        cosine = 1.0 + q * (
-            -0.5
-            + q * (1 / 24 + q * (-1 / 720 + q * (1 / 40320 + q * (-1 / 3628800 + q / 479001600))))
-        )
+        # Angles are below 0.14: what the series lack is below 1e-17.
+        sine = 1 / 120 + q * (-1 / 5040 + q * (1 / 362880))
+        sine = angle * (1.0 + q * (-1 / 6 + q * sine))
+        cosine = 1 / 24 + q * (-1 / 720 + q * (1 / 40320 + q * (-1 / 3628800)))
+        cosine = 1.0 + q * (-0.5 + q * cosine)
         store(lines, r, c * cosine - s * sine)
         store(lines, room + r, s * cosine + c * sine)
     for side in range(2):
@@ -313,6 +309,8 @@ def polish(
                 store(lines, 12 * room + r, turn)
                 store(lines, 13 * room + r, (ux * nx + uy * ny) + distance * (turn * turn))
                 store(lines, 14 * room + r, ((ux * ny - uy * nx) - 2.0 * away * turn) * inverse)
+                store(lines, 15 * room + r, dx)
+                store(lines, 16 * room + r, dy)
         radii(record, rows, 2 + side, count, modes, scratch, lines, 5 * side)
     for r in range(0, count, LANES):
         depth = load_pair(lines, 7 * room + r) - load_pair(lines, 10 * room + r)
@@ -333,9 +331,8 @@ def polish(
         rho = load_pair(lines, 3 * room + r) + 0.5 * step * load_pair(lines, 4 * room + r)
         rho = load_pair(lines, 2 * room + r) + step * rho
         c, s = c * cosine - s * sine, s * cosine + c * sine
-        dx, dy, _, _ = gather_pair(apart, rows, room + r, 0)
-        x = rho * c - dx
-        y = rho * s - dy
+        x = rho * c - load_pair(lines, 15 * room + r)
+        y = rho * s - load_pair(lines, 16 * room + r)
         square = x * x + y * y
         inverse = 1.0 / root(square)
         moved = widen_pair(hints, r) + step

@@ -141,13 +141,13 @@ def sample_pairs(
     room = size + 5 * LANES
     width = np.float32(2.0 * math.pi / size)
     for pair in range(filled):
-        count = int(counts[pair])
-        j = other[pair]
-        begin = int(starts[pair])
-        at = owner[pair] * 2 * long + begin
+        count = int(peek(counts, pair))
+        j = peek(other, pair) * pattern.shape[1]
+        begin = int(peek(starts, pair))
+        at = peek(owner, pair) * 2 * long + begin
         row = pair * room + LANES
-        x_j = near[pair]
-        y_j = near[PAIRS + pair]
+        x_j = peek(near, pair)
+        y_j = peek(near, PAIRS + pair)
         fastest = singles(0.0)
         for s in range(0, count, LANES):
             rho = load(grid, at + s)
@@ -160,20 +160,20 @@ def sample_pairs(
             inverse = rough_root(square)
             ux = x * inverse
             uy = y * inverse
-            pr = singles(pattern[j, 1 + top])
-            pi = singles(pattern[j, 1 + n_modes + top])
+            pr = singles(peek(pattern, j + 1 + top))
+            pi = singles(peek(pattern, j + 1 + n_modes + top))
             qr = singles(0.0)
             qi = singles(0.0)
             for k in range(1, n_modes):
                 m = 1 + top - k
                 qr, qi = qr * ux + (pr - qi * uy), qr * uy + (pi + qi * ux)
                 pr, pi = (
-                    pr * ux + (pattern[j, m] - pi * uy),
-                    pr * uy + (pattern[j, n_modes + m] + pi * ux),
+                    pr * ux + (peek(pattern, j + m) - pi * uy),
+                    pr * uy + (peek(pattern, j + n_modes + m) + pi * ux),
                 )
             zr = ux * ux - uy * uy
             zi = 2.0 * ux * uy
-            store(depth, row + s, pr * zr + (pattern[j, 0] - pi * zi) - square * inverse)
+            store(depth, row + s, pr * zr + (peek(pattern, j) - pi * zi) - square * inverse)
             qr, qi = qr * ux + (2.0 * pr - qi * uy), qr * uy + (2.0 * pi + qi * ux)
             tx = slope_i * c - rho * d
             ty = slope_i * d + rho * c
@@ -182,7 +182,7 @@ def sample_pairs(
             along = (qr * zi + qi * zr) * passing - (ux * tx + uy * ty)
             store(change, row + s, width * along)
         if bits(fastest > FAST) != np.uint64(0):
-            codes[pair] = CLOSELY
+            poke(codes, pair, CLOSELY)
         if count > size:
             depth[row - 1] = depth[row + size - 1]
             change[row - 1] = change[row + size - 1]
@@ -204,14 +204,15 @@ def list_gaps(
     """
     room = size + 5 * LANES
     base: Any = np.int64(0)  # a plain 0 would have callers compiled twice
+    long = pattern.shape[1]
     for pair in range(filled):
-        count = int(counts[pair])
+        count = int(peek(counts, pair))
         poke(numbers, pair, 0)
-        if count == 0 or codes[pair] == CLOSELY:
+        if count == 0 or peek(codes, pair) == CLOSELY:
             continue
         row = pair * room + LANES
-        margin = np.float32(HULL_MARGIN) * pattern[other[pair], 0]
-        codes[pair] = INSIDE if math.copysign(1.0, depth[row]) > 0.0 else OUTSIDE
+        margin = np.float32(HULL_MARGIN) * peek(pattern, long * peek(other, pair))
+        poke(codes, pair, INSIDE if math.copysign(1.0, peek(depth, row)) > 0.0 else OUTSIDE)
         last = count - 1
         first = base
         for s in range(0, last, 2 * LANES):
@@ -237,7 +238,6 @@ def list_gaps(
                     word &= word - np.uint64(1)
             base += number
         poke(numbers, pair, base - first)
-    long = pattern.shape[1]
     listed = rows.shape[1]
     for g in range(base):
         code = peek(place, g)
