@@ -131,6 +131,44 @@ def link_steps(
 
 
 @njit(cache=True)
+def squared_residuals(
+    x: FloatArray, y: FloatArray, coefficient: FloatArray, out: FloatArray
+) -> None:
+    """Squared length, out (L,), of y (2 L,) less x (2 L, T) times its coefficients (T,).
+
+    Two rows that follow each other are the components of one step.
+    """
+    for link in range(len(out)):
+        total = 0.0
+        for row in range(2 * link, 2 * link + 2):
+            rest = y[row]
+            for term in range(x.shape[1]):
+                rest -= x[row, term] * coefficient[term]
+            total += rest * rest
+        out[link] = total
+
+
+@njit(cache=True)
+def add_weighted(
+    x: FloatArray, y: FloatArray, weight: FloatArray, normal: FloatArray, right: FloatArray
+) -> None:
+    """Add x^T W x to normal (T, T) and x^T W y to right (T,), see `squared_residuals`."""
+    terms = x.shape[1]
+    lower = np.zeros((terms, terms))
+    for row in range(len(y)):
+        for term in range(terms):
+            value = weight[row // 2] * x[row, term]
+            right[term] += value * y[row]
+            for other in range(term + 1):
+                lower[term, other] += value * x[row, other]
+    for term in range(terms):
+        for other in range(term + 1):
+            normal[term, other] += lower[term, other]
+            if other < term:
+                normal[other, term] += lower[term, other]
+
+
+@njit(cache=True)
 def neighbour_mean(
     displacement: FloatArray,
     weight: FloatArray,

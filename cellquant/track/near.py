@@ -50,6 +50,7 @@ def _visit_rings(
     for j in range(m):
         order[slot[home[j]]] = j
         slot[home[j]] += 1
+    sorted_x, sorted_y = there[order, 0], there[order, 1]
     for i in range(len(points)):
         near[:] = np.inf
         who[:] = -1
@@ -64,14 +65,20 @@ def _visit_rings(
             if bound > 0.0 and near[k - 1] < bound * bound:
                 break
             for by in range(max(cy - ring, 0), min(cy + ring, ny - 1) + 1):
-                step = 1 if abs(by - cy) == ring else 2 * ring
-                for bx in range(cx - ring, cx + ring + 1, max(step, 1)):
-                    if bx < 0 or bx >= nx:
+                # A row of a ring is one run of bins; of the rows between only the ends belong to it.
+                whole = abs(by - cy) == ring
+                for side_of_it in range(1 if whole else 2):
+                    left_bin = cx - ring if side_of_it == 0 else cx + ring
+                    right_bin = cx + ring if whole else left_bin
+                    left_bin, right_bin = max(left_bin, 0), min(right_bin, nx - 1)
+                    if left_bin > right_bin:
                         continue
-                    for s in range(begin[by * nx + bx], begin[by * nx + bx + 1]):
+                    for s in range(begin[by * nx + left_bin], begin[by * nx + right_bin + 1]):
+                        d = (sorted_x[s] - x) ** 2 + (sorted_y[s] - y) ** 2
+                        if d > near[k - 1]:
+                            continue
                         j = order[s]
-                        d = (there[j, 0] - x) ** 2 + (there[j, 1] - y) ** 2
-                        if d > near[k - 1] or (d == near[k - 1] and j > who[k - 1]):
+                        if d == near[k - 1] and j > who[k - 1]:
                             continue
                         place = k - 1
                         while place > 0 and (
