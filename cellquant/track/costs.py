@@ -334,7 +334,8 @@ def _student_fit(
     for _ in range(_FIT_ROUNDS):
         before = (scale, nu)
         normal, right = ridge.copy(), ridge @ start
-        add_weighted(flat, goal, weight * (nu + 2.0) / (nu + square / scale**2), normal, right)
+        robust: FloatArray = weight * (nu + 2.0) / (nu + square / scale**2)
+        add_weighted(flat, goal, robust, normal, right)
         coefficient = np.linalg.solve(normal, right)
         squared_residuals(flat, goal, coefficient, square)
         robust = weight * (nu + 2.0) / (nu + square / scale**2)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 from cellquant.errors import InputError
 from cellquant.tables import TRACK_COLUMNS, Cells, Tracks
@@ -143,17 +144,19 @@ def track_cells(
     elif linker == "trackpy":
         after, report = trackpy_links(movie, max_distance=max_distance, max_gap=max_gap)
     else:
-        solution = solve(
-            movie,
-            Options(
-                divisions=divisions,
-                max_distance=np.inf if max_distance is None else max_distance,
-            ),
-            masks=masks,
-            raw=raw,
-            pixel_size=cells.pixel_size,
-            progress=progress,
-        )
+        # The matrices are too small for more threads to pay; they would only wait for each other.
+        with threadpool_limits(1):
+            solution = solve(
+                movie,
+                Options(
+                    divisions=divisions,
+                    max_distance=np.inf if max_distance is None else max_distance,
+                ),
+                masks=masks,
+                raw=raw,
+                pixel_size=cells.pixel_size,
+                progress=progress,
+            )
         links = solution.links
         assert links is not None
         after, second = links.after.copy(), links.second

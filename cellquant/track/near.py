@@ -65,7 +65,7 @@ def _visit_rings(
             if bound > 0.0 and near[k - 1] < bound * bound:
                 break
             for by in range(max(cy - ring, 0), min(cy + ring, ny - 1) + 1):
-                # A row of a ring is one run of bins; of the rows between only the ends belong to it.
+                # A row of a ring is one run of bins; of those between only the ends belong to it.
                 whole = abs(by - cy) == ring
                 for side_of_it in range(1 if whole else 2):
                     left_bin = cx - ring if side_of_it == 0 else cx + ring
