@@ -336,9 +336,7 @@ def polish(
         square = x * x + y * y
         inverse = 1.0 / root(square)
         moved = widen_pair(hints, r) + step
-        inside = (moved > widen_pair(hints, room + r)) & (
-            moved < widen_pair(hints, 2 * room + r)
-        )
+        inside = (moved > widen_pair(hints, room + r)) & (moved < widen_pair(hints, 2 * room + r))
         # What is left out is of order three: of the step, and of the radius there.
         error = absolute(newton) * (jerk * newton * newton + 2.0 * second * second)
         error = choose(inside, error, 1.0)

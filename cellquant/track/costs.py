@@ -334,9 +334,9 @@ def _student_fit(
     for _ in range(_FIT_ROUNDS):
         before = (scale, nu)
         normal, right = ridge.copy(), ridge @ start
-        robust: FloatArray = weight * (nu + 2.0) / (nu + square / scale**2)
+        robust = weight * (nu + 2.0) / (nu + square / scale**2)
         add_weighted(flat, goal, robust, normal, right)
-        coefficient = np.linalg.solve(normal, right)
+        coefficient = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
         squared_residuals(flat, goal, coefficient, square)
         robust = weight * (nu + 2.0) / (nu + square / scale**2)
         scale = float(np.sqrt((robust @ square / 2 + _PRIOR_LINKS * prior_scale) / total))
