@@ -251,22 +251,38 @@ def threads():
 
 
 def scaling():
-    """Time per cell of one step, and memory per cell, against the number of cells."""
+    """Time per cell of one evaluation, and memory per cell, against the number of cells.
+
+    Turns of the same number of cells, so that what disturbs one size disturbs the others as much.
+    """
     numba.set_num_threads(1)
-    table = []
-    for n_cells in (1024, 4096, 16384, 65536):
+    sizes = (1024, 4096, 16384, 65536)
+    jobs, memory = {}, {}
+    for n_cells in sizes:
         scene = Scene(n_cells=n_cells)
         state, radius, box = settle(scene, 0.4)
         tracemalloc.start()
         layer = Layer(scene, radius, box)
         job = evaluation(layer, state)
         job()
-        memory = tracemalloc.get_traced_memory()[0] / n_cells
+        memory[n_cells] = tracemalloc.get_traced_memory()[0] / n_cells
         tracemalloc.stop()
-        times = [in_turns({"exact": job}, rounds=5)["exact"][3] for _ in range(3)]
-        table.append({"cells": n_cells, "ns_per_cell": min(times) / n_cells * 1e9, "bytes": memory})
-        print(table[-1], flush=True)
+        jobs[n_cells] = repeated(job, sizes[-1] // n_cells)
+    found = in_turns(jobs, rounds=25)
+    table = [
+        {"cells": n, "ns_per_cell": found[n][0] / sizes[-1] * 1e9, "bytes": memory[n]}
+        for n in sizes
+    ]
+    print(table, flush=True)
     return table
+
+
+def repeated(job, times):
+    def several():
+        for _ in range(times):
+            job()
+
+    return several
 
 
 def steps(scene, state, radius, box):
