@@ -9,10 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from numba.core.registry import CPUDispatcher
 
 import cellquant
+from cellquant.sim import parts as parts_of_work
 from cellquant.sim.parts import Shared
 
 SIMULATE = """
@@ -83,6 +85,37 @@ def test_loosely_compiled_work_on_a_layer_is_shared_by_address() -> None:
         and kernel.targetoptions.get("fastmath")
     ]
     assert not loops, f"make {loops} shared"
+
+
+def test_arrays_are_read_where_they_are_described() -> None:
+    """Of every kind and dimension that kernels read, also after they were made anew."""
+
+    def total(part: int, n_parts: int, kept: Any, state: Any, out: Any) -> None:
+        flat, plane, solid, small = parts_of_work.taken(kept)
+        modes, tension, torque = parts_of_work.features_of(kept)
+        out[0, 0] = flat.sum() + plane[1, 2] + solid[1, 0, 1] + small[-1] + state[0, 1]
+        out[0, 1] = plane.shape[1] * len(modes) + len(tension) - len(torque)
+
+    rng = np.random.default_rng(1)
+
+    def arrays() -> tuple[Any, ...]:
+        return (
+            rng.integers(0, 9, 5),
+            rng.random((2, 3)),
+            rng.random((2, 2, 2)).astype(np.float32),
+            rng.integers(0, 9, 4).astype(np.int8),
+        )
+
+    state, out = rng.random((1, 3)), np.empty((1, 2))
+    work = parts_of_work.Bound(parts_of_work.Shared(total, set()), arrays(), (4, 1, 0))
+    for _ in range(2):
+        flat, plane, solid, small = work.arrays
+        for n_parts in (1, 2):
+            out[:] = np.nan
+            work(n_parts, state, out)
+            expected = flat.sum() + plane[1, 2] + solid[1, 0, 1] + small[-1] + state[0, 1]
+            assert out.tolist() == [[pytest.approx(expected, rel=1e-15), 13.0]]
+        work.describe(arrays())
 
 
 @pytest.mark.slow

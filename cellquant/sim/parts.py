@@ -20,7 +20,7 @@ from numba.extending import intrinsic, models, register_model
 
 
 class Kept(types.Type):
-    """Address of the descriptions of arrays, as `keep` wrote them, and what code is compiled for.
+    """Address of the descriptions of arrays (see `Bound`), and what code is compiled for.
 
     `features` says how long three tuples of zeros are: one entry for each shape mode n >= 2, and
     one, or none, for tension and for torque.
@@ -40,24 +40,8 @@ class KeptModel(models.PrimitiveModel):
         super().__init__(manager, kind, ir.IntType(64))  # type: ignore[no-untyped-call]
 
 
-def _keep(_: Any, place: Any, arrays: Any) -> Any:
-    """Describe arrays at an address; whoever calls sees to it that they live on."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        kept = values[1]
-        for number, kind in enumerate(arrays):
-            array = context.make_array(kind)(context, builder, builder.extract_value(kept, number))
-            array.meminfo = ir.Constant(array.meminfo.type, None)  # not to be counted as in use
-            array.parent = ir.Constant(array.parent.type, None)
-            kept = builder.insert_value(kept, array._getvalue(), number)
-        builder.store(kept, builder.inttoptr(values[0], kept.type.as_pointer()))
-        return context.get_dummy_value()
-
-    return types.void(place, arrays), generate
-
-
 def _taken(_: Any, kept: Any) -> Any:
-    """The arrays that were kept."""
+    """The arrays that were described."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         native = context.get_value_type(kept.arrays)
@@ -89,16 +73,9 @@ def _call(_: Any, address: Any, arguments: Any) -> Any:
     return types.void(address, arguments), generate
 
 
-keep: Any = intrinsic(_keep)
 taken: Any = intrinsic(_taken)
 features_of: Any = intrinsic(_features)
 call: Any = intrinsic(_call)
-
-
-@njit(cache=True)
-def describe(place: int, arrays: Any) -> None:
-    """Write down where arrays lie, see `taken`."""
-    keep(place, arrays)
 
 
 @njit(cache=True)
@@ -139,7 +116,12 @@ class Bound:
     def describe(self, arrays: tuple[Any, ...]) -> None:
         """Take other arrays, of the same kinds."""
         self.arrays = arrays  # they live as long as they are in use
-        describe(self.kept, arrays)
+        words: list[int] = []
+        for array in arrays:
+            # As compiled code has it: owner and counter (none), entries, address, shape, strides.
+            words += 0, 0, array.size, array.itemsize, array.ctypes.data
+            words += *array.shape, *array.strides
+        self._words[:] = words
 
     def __call__(self, n_parts: int, state: Any, out: Any) -> None:
         """Do it, in parts side by side."""
