@@ -25,6 +25,7 @@ from cellquant.track.confidence import Choice, calibrated
 from cellquant.track.divisions import _log_frequency, broken_masks, weigh
 from cellquant.track.evaluate import evaluate
 from cellquant.track.flow import pair_flow
+from cellquant.track.motion_kernels import add_weighted, squared_residuals
 from cellquant.track.movie import Links, flatten
 from cellquant.track.near import nearest_cells
 from cellquant.track.solve import Options, solve
@@ -526,3 +527,17 @@ def test_large_tangles_are_solved_by_exchange(monkeypatch: pytest.MonkeyPatch) -
         assert len(set(daughters)) == len(daughters)
         worth.append(gains[links].sum() + odds[split].sum())
     assert 0.9 * worth[0] <= worth[1] <= worth[0] + 1e-9
+
+
+def test_compiled_sums_of_the_fit_equal_the_matrices() -> None:
+    rng = np.random.default_rng(5)
+    x, y, weight = rng.normal(size=(80, 6)), rng.normal(size=80), rng.random(40)
+    coefficient, square = rng.normal(size=6), np.empty(40)
+    squared_residuals(x, y, coefficient, square)
+    rest = (y - x @ coefficient).reshape(-1, 2)
+    assert square == pytest.approx((rest**2).sum(axis=1), rel=1e-13)
+    normal, right = np.eye(6), np.ones(6)
+    add_weighted(x, y, weight, normal, right)
+    both = np.repeat(weight, 2)
+    assert normal == pytest.approx(np.eye(6) + x.T @ (both[:, None] * x), rel=1e-12, abs=1e-12)
+    assert right == pytest.approx(1.0 + x.T @ (both * y), rel=1e-12, abs=1e-12)
