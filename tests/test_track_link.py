@@ -25,7 +25,7 @@ from cellquant.track.confidence import Choice, calibrated
 from cellquant.track.divisions import _log_frequency, broken_masks, weigh
 from cellquant.track.evaluate import evaluate
 from cellquant.track.flow import pair_flow
-from cellquant.track.motion_kernels import add_weighted, squared_residuals
+from cellquant.track.motion_kernels import add_weighted, decay, squared_residuals
 from cellquant.track.movie import Links, flatten
 from cellquant.track.near import nearest_cells
 from cellquant.track.solve import Options, solve
@@ -323,10 +323,12 @@ def test_a_family_is_weighed_against_the_links_it_would_break() -> None:
     cells = np.array([[0, 2, 4], [1, 3, 4]])
     odds = np.array([5.5, 2.0])
     nobody = np.empty(0, dtype=np.int64)
-    found = weigh(cells, odds, nobody, np.array([0, 1]), np.array([2, 3]), candidates, gain)
+    source, target, held = np.array([0, 1]), np.array([2, 3]), np.array([5.0, 4.0])
+    found = weigh(cells, odds, nobody, source, target, held, candidates, gain)
     better = np.exp(odds - np.array([5.0, 4.0]))
     np.testing.assert_allclose(found.weight, better / (1.0 + better.sum()))
-    taken = weigh(cells, odds, np.array([0]), np.array([1]), np.array([3]), candidates, gain)
+    source, target, held = np.array([1]), np.array([3]), np.array([4.0])
+    taken = weigh(cells, odds, np.array([0]), source, target, held, candidates, gain)
     assert taken.chosen.tolist()[0]
     assert taken.weight[0] == 1.0
 
@@ -541,3 +543,13 @@ def test_compiled_sums_of_the_fit_equal_the_matrices() -> None:
     both = np.repeat(weight, 2)
     assert normal == pytest.approx(np.eye(6) + x.T @ (both[:, None] * x), rel=1e-12, abs=1e-12)
     assert right == pytest.approx(1.0 + x.T @ (both * y), rel=1e-12, abs=1e-12)
+
+
+def test_decay_is_the_exponential() -> None:
+    x = np.concatenate((-np.geomspace(1e-12, 11.999, 4001), [0.0]))
+    found = x.copy()
+    decay(found)
+    np.testing.assert_allclose(found, np.exp(x), rtol=1e-8)
+    far = np.array([-12.0, -700.0, -1e300])
+    decay(far)
+    assert far.tolist() == [0.0, 0.0, 0.0]

@@ -33,10 +33,10 @@ def marginals(
     most = 0
     for p in range(len(start) - 1):
         most = max(most, start[p + 1] - start[p])
-    odds, from_row, from_column = np.empty(most * k), np.empty(most * k), np.empty(most * k)
-    source, target = np.empty(most * k, dtype=np.int64), np.empty(most * k, dtype=np.int64)
-    place = np.empty(most * k, dtype=np.int64)
-    total_row, total_column = np.empty(most), np.empty(most)
+    # Odds of each link, divided by its rivals at its source, and by those at its target.
+    odds, asked, arrived = np.empty(most * k), np.empty(most * k), np.empty(most * k)
+    target, place = np.empty(most * k, dtype=np.int64), np.empty(most * k, dtype=np.int64)
+    begin, total_column = np.empty(most + 1, dtype=np.int64), np.empty(most)
     first_row, first_column = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
     second_row, top_column, second_column = np.empty(most), np.empty(most), np.empty(most)
     rivals = np.empty(most, dtype=np.int64)
@@ -57,14 +57,13 @@ def marginals(
                 if j < 0:
                     continue
                 rivals[j] += 1
-                if g > top:
-                    best, top, second = c, g, top
-                elif g > second:
-                    second = g
-                if g > top_column[j]:
-                    top_column[j], second_column[j], first_column[j] = g, top_column[j], i
-                elif g > second_column[j]:
-                    second_column[j] = g
+                second = max(second, min(g, top))
+                best = c if g > top else best
+                top = max(g, top)
+                before = top_column[j]
+                second_column[j] = max(second_column[j], min(g, before))
+                first_column[j] = i if g > before else first_column[j]
+                top_column[j] = max(g, before)
             first_row[i], second_row[i] = best, second
         # Where the rivals together cannot bring a link below certainty, they are out of question.
         for i in range(n):
@@ -82,29 +81,31 @@ def marginals(
                 closed_row[i] = closed_column[j] = True
         links = 0
         for i in range(n):
+            begin[i] = links
             if closed_row[i]:
                 continue
             for c in range(k):
                 g, j = gain[first + i, c], candidates[first + i, c] - there
                 if j >= 0 and g >= least and not closed_column[j]:
-                    source[links], target[links], place[links] = i, j, c
-                    odds[links], from_column[links] = np.exp(min(g, limit)), 1.0
+                    target[links], place[links] = j, c
+                    odds[links] = arrived[links] = np.exp(min(g, limit))
                     links += 1
+        begin[n] = links
         for _ in range(rounds):
-            total_row[:] = 1.0
             total_column[:] = 1.0
+            for i in range(n):
+                total = 1.0
+                for q in range(begin[i], begin[i + 1]):
+                    total += arrived[q]
+                for q in range(begin[i], begin[i + 1]):
+                    asked[q] = odds[q] / max(total - arrived[q], 1.0)
+                    total_column[target[q]] += asked[q]
             for q in range(links):
-                total_row[source[q]] += odds[q] * from_column[q]
-            for q in range(links):
-                rest = total_row[source[q]] - odds[q] * from_column[q]
-                from_row[q] = 1.0 / max(rest, 1.0)
-                total_column[target[q]] += odds[q] * from_row[q]
-            for q in range(links):
-                rest = total_column[target[q]] - odds[q] * from_row[q]
-                from_column[q] = 1.0 / max(rest, 1.0)
-        for q in range(links):
-            belief = odds[q] * from_row[q] * from_column[q]
-            out[first + source[q], place[q]] = belief / (1.0 + belief)
+                arrived[q] = odds[q] / max(total_column[target[q]] - asked[q], 1.0)
+        for i in range(n):
+            for q in range(begin[i], begin[i + 1]):
+                belief = asked[q] * arrived[q] / odds[q]
+                out[first + i, place[q]] = belief / (1.0 + belief)
 
 
 @njit(cache=True)

@@ -11,6 +11,7 @@ from cellquant.track.motion_kernels import (
     neighbour_mean,
     pair_gains,
     squared_residuals,
+    step_ratios,
     steps_ahead,
 )
 from cellquant.track.movie import LOG_AREA, NEAR, BoolArray, FloatArray, IntArray, Links, Movie
@@ -357,16 +358,17 @@ def gains(
     fates: Fates,
     max_distance: float,
 ) -> FloatArray:
-    """Log odds (N, K) of the candidate links."""
-    gain = np.empty(candidates.shape)
-    shape = shapes.population.centred @ np.linalg.cholesky(shapes.precision)
-    expected = (shapes.memory * shapes.population.centred) @ np.linalg.cholesky(shapes.precision)
-    pair_gains(
+    """Log odds (N, K) of the candidate links.
+
+    The logarithms of the step are of single precision, several times as fast: 1e-5 of log odds.
+    """
+    spread = motion.spread * np.sqrt(movie.elapsed)
+    ratio = np.empty(candidates.shape, dtype=np.float32)
+    step_ratios(
         movie.position,
-        movie.cut,
         candidates,
         movie.elapsed,
-        motion.spread * np.sqrt(movie.elapsed),
+        spread,
         paths.own_before,
         paths.own_after,
         paths.has_before,
@@ -380,6 +382,23 @@ def gains(
         motion.tail,
         motion.slivers,
         motion.sliver_tail,
+        max_distance,
+        ratio,
+    )
+    gain = np.empty(candidates.shape)
+    shape = shapes.population.centred @ np.linalg.cholesky(shapes.precision)
+    expected = (shapes.memory * shapes.population.centred) @ np.linalg.cholesky(shapes.precision)
+    pair_gains(
+        np.log(ratio, out=ratio),
+        movie.cut,
+        candidates,
+        spread,
+        paths.has_before,
+        paths.has_after,
+        motion.scale,
+        motion.tail,
+        motion.slivers,
+        motion.sliver_tail,
         shape,
         expected,
         shapes.spread,
@@ -389,7 +408,6 @@ def gains(
         fates.stay,
         fates.vanish,
         fates.appear,
-        max_distance,
         _DOUBT,
         gain,
     )

@@ -72,6 +72,7 @@ def weigh(
     split: IntArray,
     source: IntArray,
     target: IntArray,
+    held: FloatArray,
     candidates: IntArray,
     gain: FloatArray,
 ) -> Families:
@@ -86,8 +87,8 @@ def weigh(
         Families (F, 3) and their log odds (F,).
     split
         Indices of the chosen families.
-    source, target
-        (L,) ends of the chosen links.
+    source, target, held
+        (L,) ends of the chosen links, and their log odds.
     candidates, gain
         (N, K) candidate links and their log odds.
     """
@@ -101,7 +102,7 @@ def weigh(
 
     # What each cell holds; a family that takes it away loses that, once per link or family.
     out, into, partner = np.zeros(n), np.zeros(n), np.full(n, -1, dtype=np.int64)
-    out[source] = into[target] = worth(source, target)
+    out[source] = into[target] = np.maximum(held, 0.0)
     partner[source] = target
     for role, column in ((out, 0), (into, 1), (into, 2)):
         role[cells[split, column]] = odds[split]

@@ -83,7 +83,7 @@ def pair_flow(movie: Movie, index: int, previous: FloatArray) -> FloatArray:
     if np.abs(previous).max(initial=0.0) > _SAME * spacing:
         other, other_matched = follow(previous, all_cells)
         away = np.hypot(*(flow - other).T)
-        same = float(np.quantile(away, _SAME_SHARE)) < _SAME * spacing
+        same = float(np.mean(away < _SAME * spacing)) >= _SAME_SHARE
         flow, matched = other, min(matched, other_matched)
     else:
         same = True

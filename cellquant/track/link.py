@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
+from numba import njit
 from threadpoolctl import threadpool_limits
 
 from cellquant.errors import InputError
@@ -189,10 +190,16 @@ def track_cells(
 def by_place(cells: Cells) -> Cells:
     """The cells of each frame in the order of their places: no result depends on their labels."""
     table = cells.table
-    order = np.lexsort((table["label"], table["x"], table["y"], table["frame"]))
+    frame = table["frame"].to_numpy()
+    order = np.argsort(frame, kind="stable")
+    columns = [table[name].to_numpy() for name in ("label", "x", "y")]
+    # Frame by frame: less than half the time of sorting all at once.
+    for here in np.split(order, np.flatnonzero(np.diff(frame[order])) + 1):
+        here[:] = here[np.lexsort([column[here] for column in columns])]
     return replace(cells, table=table.iloc[order].reset_index(drop=True))
 
 
+@njit(cache=True)
 def number_tracks(after: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:
     """Give every cell the number of its track and of its parent track, (N,) each.
 
@@ -200,22 +207,19 @@ def number_tracks(after: IntArray, second: IntArray) -> tuple[IntArray, IntArray
     track. A link always points to a later cell.
     """
     n = len(after)
-    following, other = after.tolist(), second.tolist()
-    track = [0] * n
-    mother = [0] * n
-    parent_of = [0]
+    track, parent = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    tracks = 0
     for cell in range(n):
         if track[cell] == 0:
-            parent_of.append(mother[cell])
-            track[cell] = len(parent_of) - 1
-        if following[cell] < 0:
+            tracks += 1
+            track[cell] = tracks
+        if after[cell] < 0:
             continue
-        if other[cell] >= 0:
-            mother[following[cell]] = mother[other[cell]] = track[cell]
+        if second[cell] >= 0:
+            parent[after[cell]] = parent[second[cell]] = track[cell]
         else:
-            track[following[cell]] = track[cell]
-    track_id = np.array(track, dtype=np.int64)
-    return track_id, np.array(parent_of, dtype=np.int64)[track_id]
+            track[after[cell]], parent[after[cell]] = track[cell], parent[cell]
+    return track, parent
 
 
 def _table(

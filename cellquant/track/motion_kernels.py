@@ -6,8 +6,25 @@ import numpy as np
 from numba import njit
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+SingleArray = np.ndarray[Any, np.dtype[np.float32]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+
+
+@njit(cache=True, fastmath={"contract"})
+def decay(x: FloatArray) -> None:
+    """Replace x (L,) <= 0 by exp(x), to 1e-8 of it; by 0 below -12.
+
+    Seven terms of the series of exp(x / 64), squared six times: without a branch, so that several
+    are computed at once.
+    """
+    for q in range(len(x)):
+        y = x[q] / 64.0
+        series = 1.0 / 120.0 + y * (1.0 / 720.0 + y / 5040.0)
+        series = 1.0 + y * (1.0 + y * (1.0 / 2.0 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y * series))))
+        for _ in range(6):
+            series *= series
+        x[q] = series if x[q] > -12.0 else 0.0
 
 
 @njit(cache=True)
@@ -30,7 +47,11 @@ def soft_flow(
     partner.
     """
     n, k = candidates.shape
-    weight = np.zeros((n, k))
+    weight, way_x, way_y = np.empty((n, k)), np.empty((n, k)), np.empty((n, k))
+    for i in range(n):
+        for c in range(k):
+            j = candidates[i, c]
+            way_x[i, c], way_y[i, c] = there[j, 0] - here[i, 0], there[j, 1] - here[i, 1]
     column = np.zeros(len(there))
     row = np.zeros(n)
     moved = np.zeros((n, 3))
@@ -38,40 +59,37 @@ def soft_flow(
     matched = 0.0
     for step in range(len(widths)):
         scale = -0.5 / widths[step] ** 2
-        column[:] = 0.0
-        row[:] = 0.0
         for i in range(n):
+            x, y = flow[i, 0], flow[i, 1]
             for c in range(k):
-                j = candidates[i, c]
-                dx = there[j, 0] - here[i, 0] - flow[i, 0]
-                dy = there[j, 1] - here[i, 1] - flow[i, 1]
-                exponent = scale * (dx * dx + dy * dy)
-                w = np.exp(exponent) if exponent > -12.0 else 0.0
-                weight[i, c] = w
-                row[i] += w
-                column[j] += w
+                weight[i, c] = scale * ((way_x[i, c] - x) ** 2 + (way_y[i, c] - y) ** 2)
+        decay(weight.reshape(n * k))
+        column[:] = 0.0
+        for i in range(n):
+            total = 0.0
+            for c in range(k):
+                total += weight[i, c]
+                column[candidates[i, c]] += weight[i, c]
+            row[i] = total
         matched = 0.0
         for i in range(n):
             mx = my = mass = 0.0
             for c in range(k):
-                if weight[i, c] == 0.0:
-                    continue
-                j = candidates[i, c]
-                w = weight[i, c] / (outlier + max(row[i], column[j]))
+                w = weight[i, c] / (outlier + max(row[i], column[candidates[i, c]]))
                 mass += w
-                mx += w * (there[j, 0] - here[i, 0])
-                my += w * (there[j, 1] - here[i, 1])
-            for d, value in enumerate((mx, my, mass)):
-                moved[i, d] = voice[i] * value
+                mx += w * way_x[i, c]
+                my += w * way_y[i, c]
+            moved[i, 0], moved[i, 1], moved[i, 2] = voice[i] * mx, voice[i] * my, voice[i] * mass
             matched += mass
         for _ in range(rounds[step]):
             for i in range(n):
-                for d in range(3):
-                    averaged[i, d] = moved[i, d]
+                mx, my, mass = moved[i]
                 for c in range(neighbours.shape[1]):
                     j = neighbours[i, c]
-                    for d in range(3):
-                        averaged[i, d] += moved[j, d]
+                    mx += moved[j, 0]
+                    my += moved[j, 1]
+                    mass += moved[j, 2]
+                averaged[i, 0], averaged[i, 1], averaged[i, 2] = mx, my, mass
             moved, averaged = averaged, moved
         for i in range(n):
             if moved[i, 2] > 1e-9:
@@ -231,9 +249,8 @@ def steps_ahead(
 
 
 @njit(cache=True)
-def pair_gains(
+def step_ratios(
     position: FloatArray,
-    cut: BoolArray,
     candidates: IntArray,
     elapsed: FloatArray,
     spread: FloatArray,
@@ -250,34 +267,15 @@ def pair_gains(
     tail: FloatArray,
     slivers: BoolArray,
     sliver_tail: float,
-    shape_after: FloatArray,
-    shape_expected: FloatArray,
-    shape_spread: FloatArray,
-    informative: FloatArray,
-    unlike: FloatArray,
-    shape_tail: float,
-    stay: FloatArray,
-    leave: FloatArray,
-    appear: FloatArray,
     max_distance: float,
-    doubt: float,
-    gain: FloatArray,
+    out: SingleArray,
 ) -> None:
-    """Log odds of every candidate link against death of one cell and birth of the other.
+    """How far each candidate lies from the predicted step: ``1 + r^2 / (width^2 nu)``, (N, K).
 
-    gain (N, K); candidates (N, K) with -1 where there is none. The residual of the displacement
-    from its prediction has a two-dimensional Student density, of slivers (N,) with a tail of their
-    own; so has the change of shape, against the density of shapes in the population, unless the
-    edge of the view cuts one of them. shape_after and shape_expected (N, F) are each cell's
-    descriptors, and those expected of its successor, in units of their scatter; unlike (N,) is the
-    negative log density of each shape in the population, up to the constants of both densities.
-    Shapes are compared where the best of them could bring a candidate within `doubt` of the
-    likeliest of its cell.
+    That is what the Student density of the residual r falls with; infinite where there is no
+    candidate, or none within the largest distance. See `pair_gains`.
     """
     n, k = candidates.shape
-    f = shape_after.shape[1]
-    half = (shape_tail + f) / 2
-    height = -np.log(2 * np.pi * scale**2)
     # What partners bring to the prediction, for cells without and with a step before.
     partner = np.empty((n, 2, 2))
     for j in range(n):
@@ -288,8 +286,7 @@ def pair_gains(
                 if has_after[j]:
                     value += b[6] * own_after[j, d]
                 partner[j, before, d] = value
-    ahead, inverse, step = np.empty((2, 2)), np.empty(2), np.empty(k)
-    power = np.empty(2)
+    ahead, inverse = np.empty((2, 2)), np.empty(2)
     for i in range(n):
         before = has_before[i]
         for after in range(2):
@@ -303,13 +300,9 @@ def pair_gains(
             width = scale[2 * before + after] * spread[i]
             nu = sliver_tail if slivers[i] else tail[2 * before + after]
             inverse[after] = elapsed[i] ** 2 / (width * width * nu)
-            power[after] = nu / 2 + 1
-        wide = f * np.log(shape_spread[i])
-        fate = stay[i] - leave[i] - 2.0 * np.log(spread[i])
-        best, most = -1, -np.inf
         for c in range(k):
             j = candidates[i, c]
-            step[c] = -np.inf
+            out[i, c] = np.inf
             if j < 0:
                 continue
             dx = position[j, 0] - position[i, 0]
@@ -317,11 +310,66 @@ def pair_gains(
             if dx * dx + dy * dy > max_distance * max_distance:
                 continue
             after = has_after[j]
-            kind = 2 * before + after
             rx = dx / elapsed[i] - ahead[after, 0] - partner[j, before, 0]
             ry = dy / elapsed[i] - ahead[after, 1] - partner[j, before, 1]
-            step[c] = height[kind] + fate - appear[j]
-            step[c] -= power[after] * np.log(1.0 + (rx * rx + ry * ry) * inverse[after])
+            out[i, c] = 1.0 + (rx * rx + ry * ry) * inverse[after]
+
+
+@njit(cache=True)
+def pair_gains(
+    log_ratio: SingleArray,
+    cut: BoolArray,
+    candidates: IntArray,
+    spread: FloatArray,
+    has_before: IntArray,
+    has_after: IntArray,
+    scale: FloatArray,
+    tail: FloatArray,
+    slivers: BoolArray,
+    sliver_tail: float,
+    shape_after: FloatArray,
+    shape_expected: FloatArray,
+    shape_spread: FloatArray,
+    informative: FloatArray,
+    unlike: FloatArray,
+    shape_tail: float,
+    stay: FloatArray,
+    leave: FloatArray,
+    appear: FloatArray,
+    doubt: float,
+    gain: FloatArray,
+) -> None:
+    """Log odds of every candidate link against death of one cell and birth of the other.
+
+    gain (N, K); candidates (N, K) with -1 where there is none; log_ratio (N, K) the logarithm of
+    `step_ratios`. The residual of the displacement from its prediction has a two-dimensional
+    Student density, of slivers (N,) with a tail of their own; so has the change of shape, against
+    the density of shapes in the population, unless the edge of the view cuts one of them.
+    shape_after and shape_expected (N, F) are each cell's descriptors, and those expected of its
+    successor, in units of their scatter; unlike (N,) is the negative log density of each shape in
+    the population, up to the constants of both densities. Shapes are compared where the best of
+    them could bring a candidate within `doubt` of the likeliest of its cell.
+    """
+    n, k = candidates.shape
+    f = shape_after.shape[1]
+    half = (shape_tail + f) / 2
+    height = -np.log(2 * np.pi * scale**2)
+    step, power = np.empty(k), np.empty(2)
+    for i in range(n):
+        kind = 2 * has_before[i]
+        for after in range(2):
+            nu = sliver_tail if slivers[i] else tail[kind + after]
+            power[after] = nu / 2 + 1
+        wide = f * np.log(shape_spread[i])
+        fate = stay[i] - leave[i] - 2.0 * np.log(spread[i])
+        best, most = -1, -np.inf
+        for c in range(k):
+            j = candidates[i, c]
+            step[c] = -np.inf
+            if log_ratio[i, c] == np.inf:
+                continue
+            after = has_after[j]
+            step[c] = height[kind + after] + fate - appear[j] - power[after] * log_ratio[i, c]
             if step[c] > most:
                 best, most = c, step[c]
         # The likeliest by its step first: it says which of the others are in doubt.

@@ -24,15 +24,14 @@ def nearest_cells(points: FloatArray, there: FloatArray, k: int) -> tuple[IntArr
 def _visit_rings(
     points: FloatArray, there: FloatArray, found: IntArray, square: FloatArray
 ) -> None:
-    """Sort the cells into bins of one on the average, and visit rings of bins around each point
-    until none that is left can hold a nearer cell."""
+    """Sort the cells into bins of one on the average, gather those around each point until no
+    other can be nearer, and rank the distances."""
     k = found.shape[1]
     m = len(there)
     if m == 0:
         found[:] = -1
         square[:] = np.inf
         return
-    near, who = np.empty(k), np.empty(k, dtype=np.int64)
     left, top = there[:, 0].min(), there[:, 1].min()
     wide, high = there[:, 0].max() - left, there[:, 1].max() - top
     side = max(np.sqrt(wide * high / m), max(wide, high) / (4.0 * m))
@@ -51,44 +50,49 @@ def _visit_rings(
         order[slot[home[j]]] = j
         slot[home[j]] += 1
     sorted_x, sorted_y = there[order, 0], there[order, 1]
+    far, who = np.empty(m + 1), np.empty(m + 1, dtype=np.int64)
+    # Within this distance there are somewhat more than k in an even layer.
+    usual = np.sqrt(1.25 * k / np.pi)
+    first = int(np.ceil(usual))
     for i in range(len(points)):
-        near[:] = np.inf
-        who[:] = -1
         x, y = points[i, 0], points[i, 1]
         cx = min(max(int(np.floor((x - left) / side)), 0), nx - 1)
         cy = min(max(int(np.floor((y - top) / side)), 0), ny - 1)
         ox, oy = x - left - cx * side, y - top - cy * side
         edge = min(min(ox, side - ox), min(oy, side - oy))
-        for ring in range(max(nx, ny)):
-            # All cells nearer than this were visited in the rings before.
-            bound = edge + (ring - 1) * side
-            if bound > 0.0 and near[k - 1] < bound * bound:
+        reach = first
+        while True:
+            x_low, x_high = max(cx - reach, 0), min(cx + reach, nx - 1)
+            y_low, y_high = max(cy - reach, 0), min(cy + reach, ny - 1)
+            # All cells nearer than this lie in these bins.
+            bound = edge + reach * side
+            if reach == first:
+                bound = min(bound, usual * side)
+            limit = max(bound, 0.0) ** 2
+            everywhere = x_high - x_low + 1 == nx and y_high - y_low + 1 == ny
+            if everywhere:
+                limit = np.inf
+            n = 0
+            for by in range(y_low, y_high + 1):
+                for s in range(begin[by * nx + x_low], begin[by * nx + x_high + 1]):
+                    away = (sorted_x[s] - x) ** 2 + (sorted_y[s] - y) ** 2
+                    far[n], who[n] = away, order[s]
+                    n += away < limit
+            if n >= k or everywhere:
                 break
-            for by in range(max(cy - ring, 0), min(cy + ring, ny - 1) + 1):
-                # A row of a ring is one run of bins; of those between only the ends belong to it.
-                whole = abs(by - cy) == ring
-                for side_of_it in range(1 if whole else 2):
-                    left_bin = cx - ring if side_of_it == 0 else cx + ring
-                    right_bin = cx + ring if whole else left_bin
-                    left_bin, right_bin = max(left_bin, 0), min(right_bin, nx - 1)
-                    if left_bin > right_bin:
-                        continue
-                    for s in range(begin[by * nx + left_bin], begin[by * nx + right_bin + 1]):
-                        d = (sorted_x[s] - x) ** 2 + (sorted_y[s] - y) ** 2
-                        if d > near[k - 1]:
-                            continue
-                        j = order[s]
-                        if d == near[k - 1] and j > who[k - 1]:
-                            continue
-                        place = k - 1
-                        while place > 0 and (
-                            d < near[place - 1] or (d == near[place - 1] and j < who[place - 1])
-                        ):
-                            near[place] = near[place - 1]
-                            who[place] = who[place - 1]
-                            place -= 1
-                        near[place] = d
-                        who[place] = j
+            reach += 1
         for q in range(k):
-            found[i, q] = who[q]
-            square[i, q] = near[q]
+            found[i, q] = -1
+            square[i, q] = np.inf
+        for c in range(n):
+            j, here, rank = who[c], far[c], 0
+            for q in range(n):
+                rank += far[q] < here
+            if rank >= k:
+                continue
+            # Cells as far as each other have one rank, and stand there in order of their index.
+            while rank < k and found[i, rank] >= 0:
+                found[i, rank], j = min(found[i, rank], j), max(found[i, rank], j)
+                rank += 1
+            if rank < k:
+                found[i, rank], square[i, rank] = j, here

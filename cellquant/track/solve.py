@@ -367,7 +367,8 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
         links=chosen,
         divisions=len(row) + split,
     )
-    state.families = weigh(families, odds, split, row[chosen], column[chosen], candidates, gain)
+    row, slot, column, sure = row[chosen], slot[chosen], column[chosen], sure[chosen]
+    state.families = weigh(families, odds, split, row, column, gain[row, slot], candidates, gain)
     if looks:
         taken = np.zeros(len(odds), dtype=bool)
         taken[split] = True
@@ -376,8 +377,7 @@ def _assign(state: Solution, middle: FloatArray, images: PairImages | None) -> L
     after = np.full(n, -1, dtype=np.int64)
     second, before = after.copy(), after.copy()
     confidence = np.zeros(n)
-    row, column = row[chosen], column[chosen]
-    after[row], before[column], confidence[column] = column, row, sure[chosen]
+    after[row], before[column], confidence[column] = column, row, sure
     mother, one, two = families[split].T
     after[mother], second[mother] = one, two
     before[one] = before[two] = mother
