@@ -9,7 +9,7 @@ fill the waits of the other, which long chains of operations need.
 
 Arithmetic between vectors and plain numbers spreads the number over all lanes. Comparisons give
 masks, for `choose` and `bits`. Arrays are read and written at a flat index, contiguous and without
-a check of bounds.
+a check of bounds; numbers that lie scattered are read and written four at a time by `gathers`.
 """
 
 import operator
@@ -86,10 +86,10 @@ def _spread(context: Any, builder: Any, value: Any, kind: Any, vector: Any) -> A
     value = context.cast(builder, value, kind, vector.kind)
     undefined = ir.Constant(vector.native, ir.Undefined)
     one = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-    return _shuffle(builder, one, undefined, [0] * vector.lanes)
+    return shuffle(builder, one, undefined, [0] * vector.lanes)
 
 
-def _shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
+def shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
     places = ir.Constant(ir.VectorType(ir.IntType(32), len(order)), order)
     return builder.shuffle_vector(a, b, places)
 
@@ -150,12 +150,12 @@ def _neg(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     return builder.fneg(args[0], flags=CONTRACT)
 
 
-def _pointer(context: Any, builder: Any, array_type: Any, array: Any, at: Any) -> Any:
+def pointer(context: Any, builder: Any, array_type: Any, array: Any, at: Any) -> Any:
     data = context.make_array(array_type)(context, builder, array).data
     return builder.gep(data, [at])
 
 
-def _kind_of(array: Any) -> Any:
+def kind_of(array: Any) -> Any:
     kinds = {types.float64: DOUBLES, types.float32: SINGLES}
     return kinds.get(array.dtype) if isinstance(array, types.Array) else None
 
@@ -163,10 +163,10 @@ def _kind_of(array: Any) -> Any:
 def _loader(pair: bool) -> Any:
     def load(_: Any, array: Any, at: Any) -> Any:
         """The numbers from a flat index of an array on."""
-        kind = PAIRS[_kind_of(array)] if pair else _kind_of(array)
+        kind = PAIRS[kind_of(array)] if pair else kind_of(array)
 
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            place = _pointer(context, builder, signature.args[0], args[0], args[1])
+            place = pointer(context, builder, signature.args[0], args[0], args[1])
             size = NATIVE[kind.kind].get_abi_size(context.target_data)
             return builder.load(builder.bitcast(place, kind.native.as_pointer()), align=size)
 
@@ -179,7 +179,7 @@ def _store(_: Any, array: Any, at: Any, vector: Any) -> Any:
     """Put a vector at a flat index of an array, doubles also in single precision."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = _pointer(context, builder, signature.args[0], args[0], args[1])
+        place = pointer(context, builder, signature.args[0], args[0], args[1])
         size = NATIVE[array.dtype].get_abi_size(context.target_data)
         value = args[2]
         if array.dtype != vector.kind:
@@ -196,7 +196,7 @@ def _peek(_: Any, array: Any, at: Any) -> Any:
     """The number at a flat index of an array, which is not counted from its end."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(_pointer(context, builder, signature.args[0], args[0], args[1]))
+        return builder.load(pointer(context, builder, signature.args[0], args[0], args[1]))
 
     return array.dtype(array, types.intp), generate
 
@@ -205,7 +205,7 @@ def _poke(_: Any, array: Any, at: Any, value: Any) -> Any:
     """Put a number at a flat index of an array."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], _pointer(context, builder, signature.args[0], args[0], args[1]))
+        builder.store(args[2], pointer(context, builder, signature.args[0], args[0], args[1]))
         return context.get_dummy_value()
 
     return types.void(array, types.intp, array.dtype), generate
@@ -324,12 +324,12 @@ def _widener(pair: bool) -> Any:
         """Doubles from a flat index of an array of singles on."""
 
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            place = _pointer(context, builder, signature.args[0], args[0], args[1])
+            place = pointer(context, builder, signature.args[0], args[0], args[1])
             narrow = ir.VectorType(ir.FloatType(), kind.lanes)
             value = builder.load(builder.bitcast(place, narrow.as_pointer()), align=4)
             return builder.fpext(value, kind.native)
 
-        return kind(array, types.intp) if _kind_of(array) == SINGLES else None, generate
+        return kind(array, types.intp) if kind_of(array) == SINGLES else None, generate
 
     return intrinsic(widen)
 
@@ -373,102 +373,11 @@ def _count_ones(_: Any, word: Any) -> Any:
     return types.intp(types.uint64), generate
 
 
-def _transpose(builder: Any, a: Any, b: Any, c: Any, d: Any) -> list[Any]:
-    ab = [_shuffle(builder, a, b, order) for order in ([0, 4, 2, 6], [1, 5, 3, 7])]
-    cd = [_shuffle(builder, c, d, order) for order in ([0, 4, 2, 6], [1, 5, 3, 7])]
-    return [
-        _shuffle(builder, ab[number % 2], cd[number % 2], order)
-        for number, order in enumerate(([0, 1, 4, 5],) * 2 + ([2, 3, 6, 7],) * 2)
-    ]
-
-
-def _scatter(_: Any, array: Any, at: Any, stride: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Put lane r of four vectors of doubles side by side, at the flat index at + r stride."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place, step = args[1:3]
-        for first in range(0, a.lanes, 4):
-            order = list(range(first, first + 4))
-            quads = [_shuffle(builder, vector, vector, order) for vector in args[3:]]
-            for vector in _transpose(builder, *quads):
-                if array.dtype is types.float32:
-                    vector = builder.fptrunc(vector, ir.VectorType(ir.FloatType(), 4))
-                pointer = _pointer(context, builder, signature.args[0], args[0], place)
-                builder.store(vector, builder.bitcast(pointer, vector.type.as_pointer()), align=4)
-                place = builder.add(place, step)
-        return context.get_dummy_value()
-
-    known = a.kind is types.float64
-    return types.void(array, types.intp, types.intp, a, b, c, d) if known else None, generate
-
-
-def _scatter_rows(
-    _: Any, array: Any, rows: Any, at: Any, plus: Any, a: Any, b: Any, c: Any, d: Any
-) -> Any:
-    """Put lane r of four vectors of doubles side by side, at the flat index rows[at + r] + plus."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = args[2]
-        for first in range(0, a.lanes, 4):
-            order = list(range(first, first + 4))
-            quads = [_shuffle(builder, vector, vector, order) for vector in args[4:]]
-            for vector in _transpose(builder, *quads):
-                row = builder.load(_pointer(context, builder, signature.args[1], args[1], place))
-                row = builder.add(row, args[3])
-                pointer = _pointer(context, builder, signature.args[0], args[0], row)
-                builder.store(vector, builder.bitcast(pointer, vector.type.as_pointer()), align=8)
-                place = builder.add(place, ir.Constant(place.type, 1))
-        return context.get_dummy_value()
-
-    known = a.kind is types.float64
-    signature = types.void(array, rows, types.intp, types.intp, a, b, c, d)
-    return signature if known else None, generate
-
-
-def _gatherer(pair: bool) -> Any:
-    def gather(_: Any, array: Any, rows: Any, at: Any, plus: Any) -> Any:
-        """Four vectors: the numbers at rows[at + lane] + plus + 0 .. 3 of an array.
-
-        Every lane reads four neighbouring numbers at once; the lanes are then transposed.
-        """
-        kind = PAIRS[_kind_of(array)] if pair else _kind_of(array)
-
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            native = NATIVE[kind.kind]
-            four = ir.VectorType(native, 4)
-            size = native.get_abi_size(context.target_data)
-            quads = []
-            for lane in range(kind.lanes):
-                place = builder.add(args[2], ir.Constant(args[2].type, lane))
-                row = builder.load(_pointer(context, builder, signature.args[1], args[1], place))
-                row = builder.add(row, args[3])
-                pointer = _pointer(context, builder, signature.args[0], args[0], row)
-                quads.append(builder.load(builder.bitcast(pointer, four.as_pointer()), align=size))
-            parts = [
-                _transpose(builder, *quads[first : first + 4]) for first in range(0, kind.lanes, 4)
-            ]
-            while len(parts) > 1:
-                order = list(range(2 * parts[0][0].type.count))
-                parts = [
-                    [_shuffle(builder, x, y, order) for x, y in zip(*two, strict=True)]
-                    for two in zip(parts[::2], parts[1::2], strict=True)
-                ]
-            return context.make_tuple(builder, signature.return_type, parts[0])
-
-        result = types.UniTuple(kind, 4)  # type: ignore[no-untyped-call]
-        return result(array, rows, types.intp, types.intp), generate
-
-    return intrinsic(gather)
-
-
 load: Any = _loader(False)
 load_pair: Any = _loader(True)
 store: Any = intrinsic(_store)
 peek: Any = intrinsic(_peek)
 poke: Any = intrinsic(_poke)
-gather: Any = _gatherer(False)
-gather_pair: Any = _gatherer(True)
-scatter: Any = intrinsic(_scatter)
 choose: Any = intrinsic(_choose)
 least: Any = _extreme("<")
 greatest: Any = _extreme(">")
@@ -490,4 +399,3 @@ singles_pair: Any = _spreader(PAIRS[SINGLES])
 bits: Any = intrinsic(_bits)
 trailing_zeros: Any = intrinsic(_trailing_zeros)
 count_ones: Any = intrinsic(_count_ones)
-scatter_rows: Any = intrinsic(_scatter_rows)

@@ -13,7 +13,10 @@ from typing import Any
 
 from numba import njit
 
-from cellquant.sim.lanes import LANES, gather_pair, scatter_rows
+from cellquant.sim.gathers import gather_pair, scatter_rows
+from cellquant.sim.lanes import (
+    LANES,
+)
 
 ROOT = 8  # columns of a root
 LENS = 8  # columns of a lens

@@ -11,8 +11,17 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from cellquant.sim.gathers import gather
 from cellquant.sim.grazes import gap
-from cellquant.sim.lanes import QUAD, doubles, gather, load, peek, poke, root, store
+from cellquant.sim.lanes import (
+    QUAD,
+    doubles,
+    load,
+    peek,
+    poke,
+    root,
+    store,
+)
 from cellquant.sim.lenses import LENS, ROOT
 from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import features_of, shared, taken

@@ -8,6 +8,7 @@ from typing import Any
 
 from numba import njit
 
+from cellquant.sim.gathers import gather_pair, scatter_rows
 from cellquant.sim.grazes import FLAGS, HULL_MARGIN
 from cellquant.sim.lanes import (
     LANES,
@@ -17,13 +18,11 @@ from cellquant.sim.lanes import (
     differ,
     doubles_pair,
     either,
-    gather_pair,
     greatest,
     least,
     load_pair,
     pick,
     root,
-    scatter_rows,
     singles_pair,
     store,
     widen_pair,

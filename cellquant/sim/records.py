@@ -9,15 +9,14 @@ from typing import Any
 
 from numba import njit
 
+from cellquant.sim.gathers import gather, scatter
 from cellquant.sim.lanes import (
     QUAD,
     choose,
     doubles,
     floor,
-    gather,
     load,
     root,
-    scatter,
     store,
 )
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from cellquant.sim.gathers import gather_pair, scatter
 from cellquant.sim.grazes import FLAGS, HULL_MARGIN
 from cellquant.sim.lanes import (
     LANES,
@@ -20,7 +21,6 @@ from cellquant.sim.lanes import (
     count_ones,
     doubles_pair,
     floor,
-    gather_pair,
     greatest,
     least,
     load,
@@ -29,7 +29,6 @@ from cellquant.sim.lanes import (
     poke,
     root,
     rough_root,
-    scatter,
     singles,
     store,
     trailing_zeros,

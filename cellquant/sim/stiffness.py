@@ -23,14 +23,13 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from cellquant.sim.contacts import Layer
+from cellquant.sim.gathers import gather_pair, scatter
 from cellquant.sim.lanes import (
     LANES,
     absolute,
-    gather_pair,
     greatest,
     load_pair,
     root,
-    scatter,
     store,
 )
 from cellquant.sim.lenses import ROOT

@@ -11,7 +11,7 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, fastmath={"contract"}, forceinline=True)
 def decay(x: FloatArray) -> None:
     """Replace x (L,) <= 0 by exp(x), to 1e-8 of it; by 0 below -12.
 
