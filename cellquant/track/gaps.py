@@ -67,39 +67,40 @@ def _candidates(
     n_frames = len(movie.time)
     ends_of = np.searchsorted(ends_all, movie.start)
     starts_of = np.searchsorted(starts_all, movie.start)
+    end, place = np.empty(0, dtype=np.int64), np.empty((0, 2))
     for index in range(n_frames - 2):
-        ends = ends_all[ends_of[index] : ends_of[index + 1]]
-        if len(ends) == 0:
+        fresh = ends_all[ends_of[index] : ends_of[index + 1]]
+        end = np.concatenate((end, fresh))
+        place = np.concatenate((place, movie.position[fresh] + flow[fresh]))
+        later = index + 2
+        span = (movie.time[later] - movie.time[movie.frame_index[end]]).astype(np.float64)
+        open_yet = span <= max_gap + 1
+        end, place, span = end[open_yet], place[open_yet], span[open_yet]
+        if len(end) == 0:
             continue
-        place = movie.position[ends] + flow[ends]
-        for later in range(index + 2, n_frames):
-            span = float(movie.time[later] - movie.time[index])
-            if span > max_gap + 1 or max_gap < 1:
-                break
-            # The flow of the missing frame, read where the cell would be.
-            bridge = movie.cells_of(later - 1)
-            nearest, _ = nearest_cells(place, movie.position[bridge], 1)
-            place = place + flow[bridge][nearest[:, 0]]
-            starts = starts_all[starts_of[later] : starts_of[later + 1]]
-            if len(starts) == 0:
-                continue
-            k = min(_NEAREST, len(starts))
-            found, _ = nearest_cells(place, movie.position[starts], k)
-            row = np.repeat(np.arange(len(ends)), k)
-            column = found.reshape(-1)
-            a, b = ends[row], starts[column]
-            away = movie.position[b] - place[row]
-            raw = np.hypot(*(movie.position[b] - movie.position[a]).T)
-            width = motion.scale[0] * span
-            nu = motion.tail[0]
-            value = -np.log(2 * np.pi * width**2)
-            value = value - (nu / 2 + 1) * np.log1p(np.sum(away**2, axis=1) / (nu * width**2))
-            value += shapes.odds(a, b) - solution.fates.vanish[a] - solution.fates.appear[b]
-            value[raw > max_distance * span] = -np.inf
-            sources.append(a)
-            targets.append(b)
-            values.append(value)
-            spans.append(np.full(len(a), round(span) - 1, dtype=np.int64))
+        # The flow of the missing frame, read where the cells would be.
+        bridge = movie.cells_of(later - 1)
+        nearest, _ = nearest_cells(place, movie.position[bridge], 1)
+        place = place + flow[bridge][nearest[:, 0]]
+        starts = starts_all[starts_of[later] : starts_of[later + 1]]
+        if len(starts) == 0:
+            continue
+        k = min(_NEAREST, len(starts))
+        found, _ = nearest_cells(place, movie.position[starts], k)
+        row = np.repeat(np.arange(len(end)), k)
+        a, b, span = end[row], starts[found.reshape(-1)], span[row]
+        away = movie.position[b] - place[row]
+        raw = np.hypot(*(movie.position[b] - movie.position[a]).T)
+        width = motion.scale[0] * span
+        nu = motion.tail[0]
+        value = -np.log(2 * np.pi * width**2)
+        value = value - (nu / 2 + 1) * np.log1p(np.sum(away**2, axis=1) / (nu * width**2))
+        value += shapes.odds(a, b) - solution.fates.vanish[a] - solution.fates.appear[b]
+        value[raw > max_distance * span] = -np.inf
+        sources.append(a)
+        targets.append(b)
+        values.append(value)
+        spans.append(span.astype(np.int64) - 1)
     if not sources:
         none = np.empty(0, dtype=np.int64)
         return none, none, np.empty(0), none
