@@ -45,6 +45,8 @@ def _taken(_: Any, kept: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         native = context.get_value_type(kept.arrays)
+        builder.function.attributes.add("nounwind")
+        builder.function.attributes.alignstack = 32
         return builder.load(builder.inttoptr(values[0], native.as_pointer()))
 
     return kept.arrays(kept), generate
