@@ -211,6 +211,20 @@ def _poke(_: Any, array: Any, at: Any, value: Any) -> Any:
     return types.void(array, types.intp, array.dtype), generate
 
 
+def _fetch(_: Any, array: Any, at: Any) -> Any:
+    """Have the number at a flat index of an array brought close, for it is needed soon."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
+        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")  # type: ignore[no-untyped-call]
+        place = pointer(context, builder, signature.args[0], args[0], args[1])
+        builder.call(callee, [builder.bitcast(place, byte), word(0), word(3), word(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
 def _choose(_: Any, mask: Any, a: Any, b: Any) -> Any:
     """Lane by lane a where the mask is true, else b."""
     common = _common(a, b)
@@ -378,6 +392,7 @@ load_pair: Any = _loader(True)
 store: Any = intrinsic(_store)
 peek: Any = intrinsic(_peek)
 poke: Any = intrinsic(_poke)
+fetch: Any = intrinsic(_fetch)
 choose: Any = intrinsic(_choose)
 least: Any = _extreme("<")
 greatest: Any = _extreme(">")

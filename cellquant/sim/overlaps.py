@@ -16,6 +16,7 @@ from cellquant.sim.grazes import gap
 from cellquant.sim.lanes import (
     QUAD,
     doubles,
+    fetch,
     load,
     peek,
     poke,
@@ -245,6 +246,8 @@ def exact_velocity(part: int, n_parts: int, kept: Any, state: Any, velocity: Any
                 rows[column] = i * record.shape[1]
                 rows[QUAD + column] = i * tangent.shape[1]
             fill_lanes(record, tangent, rows, modes, tension, lane)
+            for b in range(back_first[min(begin + QUAD, end)], back_first[min(begin + 2 * QUAD, end)]):
+                fetch(lenses, LENS * peek(back_pair, b))
             for column in range(min(QUAD, end - begin)):
                 i = begin + column
                 fx = 0.0
@@ -282,6 +285,7 @@ def exact_velocity(part: int, n_parts: int, kept: Any, state: Any, velocity: Any
                             filled = 0
                             used = 0
                         poke(places, filled * QUAD + column, ROOT * r + 4 * side)
+                        fetch(roots, ROOT * r)
                         filled += 1
                     if arc_r > 0.0 and arc_i >= 0.0:
                         # Short arcs are added by turning one by the other, quarter turns apart.
