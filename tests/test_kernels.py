@@ -107,7 +107,10 @@ def test_arrays_are_read_where_they_are_described() -> None:
         )
 
     state, out = rng.random((1, 3)), np.empty((1, 2))
-    work = parts_of_work.Bound(parts_of_work.Shared(total, set()), arrays(), (4, 1, 0))
+    kernel = parts_of_work.Shared(total, set())
+    work = parts_of_work.Bound(kernel, arrays(), (4, 1, 0))
+    (compiled_kernel,) = kernel._compiled.values()
+    assert "alignstack=32" in compiled_kernel.inspect_llvm()
     for _ in range(2):
         flat, plane, solid, small = work.arrays
         for n_parts in (1, 2):

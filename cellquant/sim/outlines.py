@@ -29,6 +29,7 @@ from cellquant.sim.lanes import (
     root,
     singles,
     store,
+    zeros,
 )
 from cellquant.sim.parts import features_of, shared, taken
 from cellquant.sim.records import HEAD, write_records
@@ -56,8 +57,9 @@ def compass(modes: int, size: int) -> tuple[Any, Any]:
     """cos(n phi_s), sin(n phi_s) in rows 2(n - 1), 2(n - 1) + 1, in double and in single."""
     angle = 2.0 * math.pi * np.arange(size) / size
     rows = [f(n * angle) for n in range(1, max(modes, 1) + 1) for f in (np.cos, np.sin)]
-    table = np.ascontiguousarray(rows)
-    return table, table.astype(np.float32)
+    table, single = zeros(len(rows), size), zeros(len(rows), size, kind=np.float32)
+    table[:] = single[:] = rows
+    return table, single
 
 
 def rim(size: int) -> Any:

@@ -246,7 +246,9 @@ def exact_velocity(part: int, n_parts: int, kept: Any, state: Any, velocity: Any
                 rows[column] = i * record.shape[1]
                 rows[QUAD + column] = i * tangent.shape[1]
             fill_lanes(record, tangent, rows, modes, tension, lane)
-            for b in range(back_first[min(begin + QUAD, end)], back_first[min(begin + 2 * QUAD, end)]):
+            for b in range(
+                back_first[min(begin + QUAD, end)], back_first[min(begin + 2 * QUAD, end)]
+            ):
                 fetch(lenses, LENS * peek(back_pair, b))
             for column in range(min(QUAD, end - begin)):
                 i = begin + column

@@ -7,6 +7,10 @@ a body is compiled once, as a C function, and the loop calls it by its address.
 
 To hand over an array costs about half a microsecond, and a kernel reads some twenty. The arrays
 that stay the same from call to call are described once, in memory, and called by address as well.
+
+Vectors for which there is no register are kept on the stack. Where that starts is a matter of
+chance; unless it is aligned, they may lie across two cache lines, or two pages, and the same code
+takes up to a tenth longer in one process than in another.
 """
 
 from collections.abc import Callable
@@ -17,6 +21,8 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import cfunc, njit, prange, typeof, types
 from numba.extending import intrinsic, models, register_model
+
+STACK = 32  # bytes of a vector
 
 
 class Kept(types.Type):
@@ -45,8 +51,9 @@ def _taken(_: Any, kept: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         native = context.get_value_type(kept.arrays)
+        # An alignment alone would not be written down.
         builder.function.attributes.add("nounwind")
-        builder.function.attributes.alignstack = 32
+        builder.function.attributes.alignstack = STACK
         return builder.load(builder.inttoptr(values[0], native.as_pointer()))
 
     return kept.arrays(kept), generate
