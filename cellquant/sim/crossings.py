@@ -24,8 +24,8 @@ from cellquant.sim.parts import features_of, shared, taken
 from cellquant.sim.polishing import TWO, UNSURE, judge_gaps, polish
 from cellquant.sim.sampling import (
     CLOSELY,
-    FULL,
     INSIDE,
+    LISTED,
     PAIRS,
     find_windows,
     list_gaps,
@@ -33,7 +33,6 @@ from cellquant.sim.sampling import (
     sample_pairs,
 )
 
-LISTED = 2 * FULL + 4 * LANES  # gaps and second crossings
 MOST_OF_A_GAP = 64  # crossings, where it is searched in double precision
 SETTLED = 2e-9  # error of an angle that needs no further steps
 EVERY = np.uint64((1 << LANES) - 1)  # lanes of a mask
@@ -82,7 +81,7 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
     modes, _, _ = features_of(kept)
     n_cells = record.shape[0]
     stride = record.shape[1]
-    size = compass.shape[1]
+    size = 8 * max(6, len(modes) + 1)
     spacing: Any = np.float32(2.0 * math.pi / size)
     n_blocks = (n_cells + BLOCK - 1) // BLOCK
     room = roots.shape[0] // n_blocks

@@ -276,7 +276,7 @@ def sample(
     n_modes = len(modes)
     size = 8 * max(6, n_modes + 1)
     half = size // 2
-    long = grid.shape[2]
+    long = 3 * (size // 2) + 2 * LANES
     for m in range(2 * n_modes):
         value = np.float32(record[i, HEAD + m])
         pattern[i, 1 + m] = value

@@ -28,6 +28,7 @@ from cellquant.sim.lanes import (
     widen_pair,
 )
 from cellquant.sim.records import HEAD
+from cellquant.sim.sampling import LISTED
 
 END_MARGIN = 2e-6  # of a sample in single precision, relative to A0
 FINE_MARGIN = 1e-5  # of the interpolation through four samples, single precision included
@@ -94,7 +95,7 @@ def judge_gaps(
     Rows of `piece` hold p, q at u = t + 1, the depth and its slope at the end, the part of the gap
     that is searched, and t. Each pass is short, so that operations seldom wait for each other.
     """
-    room = hints.shape[1]
+    room = LISTED
     for g in range(begin, end, 2 * LANES):
         before, g0, g1, after = gather_pair(depth, place, g, -1)
         e_before, e0, e1, e_after = gather_pair(change, place, g, -1)
@@ -217,7 +218,7 @@ def radii(
     """
     n_modes = len(modes)
     top = n_modes - 1
-    room = rows.shape[1]
+    room = LISTED
     imaginary = n_modes * LANES
     for r in range(0, count, LANES):
         c = load_pair(lines, column * room + r)
@@ -265,7 +266,7 @@ def polish(
     begins; row 0 of `lines` takes its error, row 1 the angle. Each pass is short, so that
     operations seldom wait for each other.
     """
-    room = rows.shape[1]
+    room = LISTED
     jerk = 1.0 * (len(modes) + 1) ** 2  # a sixth of the third derivative of rho over A0, and more
     for r in range(0, count, LANES):
         c, s, _, _ = gather_pair(circle, rows, r, 0)

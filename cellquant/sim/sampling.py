@@ -37,6 +37,7 @@ from cellquant.sim.lanes import (
 PAIRS = 112  # pairs whose contours are sampled before the gaps between samples are judged
 MANY = 12  # gaps of one pair that may hold a crossing; with more it is searched in double precision
 FULL = 4 * PAIRS  # gaps of all of them; pairs for which there is no room are searched in it too
+LISTED = 2 * FULL + 4 * LANES  # gaps and second crossings, and room to read on
 CLOSELY, OUTSIDE, INSIDE = -1, -2, -3  # what a pair without gaps is
 NARROW = 0.1  # smallest radius over A0 for which single precision is trusted
 FAST = 3.0  # turns round the centre of j per turn of i, above which modes of j are undersampled
@@ -62,7 +63,7 @@ def place_pairs(
     Rows of `rows`: where the records of i and of j begin, and the numbers of the pairs' shifts.
     `codes` takes CLOSELY where a contour is narrow.
     """
-    room = rows.shape[1]
+    room = PAIRS
     nothing = doubles_pair(0.0)
     for k in range(filled):
         codes[k] = OUTSIDE
@@ -136,12 +137,12 @@ def sample_pairs(
     n_modes = len(modes)
     top = n_modes - 1
     size = 8 * max(6, n_modes + 1)
-    long = grid.shape[2]
+    long = 3 * (size // 2) + 2 * LANES
     room = size + 5 * LANES
     width = np.float32(2.0 * math.pi / size)
     for pair in range(filled):
         count = int(peek(counts, pair))
-        j = peek(other, pair) * pattern.shape[1]
+        j = peek(other, pair) * (1 + 4 * n_modes)
         begin = int(peek(starts, pair))
         at = peek(owner, pair) * 2 * long + begin
         row = pair * room + LANES
@@ -237,7 +238,6 @@ def list_gaps(
                     word &= word - np.uint64(1)
             base += number
         poke(numbers, pair, base - first)
-    listed = rows.shape[1]
     for g in range(base):
         code = peek(place, g)
         pair = code >> 16
@@ -251,9 +251,9 @@ def list_gaps(
         poke(weight, g, 0.0 if edge else 1.0)
         poke(mean, g, peek(pattern, long * j))
         poke(rows, g, 4 * at)
-        poke(rows, listed + g, 4 * pair)
-        poke(rows, 2 * listed + g, stride * peek(owner, pair))
-        poke(rows, 3 * listed + g, stride * j)
+        poke(rows, LISTED + g, 4 * pair)
+        poke(rows, 2 * LISTED + g, stride * peek(owner, pair))
+        poke(rows, 3 * LISTED + g, stride * j)
     for g in range(base, base + 2 * LANES):
         place[g] = LANES  # what fills up the last vector
     return int(base)
