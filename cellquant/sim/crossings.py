@@ -23,10 +23,19 @@ from cellquant.sim.outlines import BLOCK
 from cellquant.sim.parts import features_of, shared, taken
 from cellquant.sim.polishing import TWO, UNSURE, judge_gaps, polish
 from cellquant.sim.sampling import (
+    ANGLE,
     CLOSELY,
+    HIGH,
     INSIDE,
+    KIND,
     LISTED,
+    LOW,
+    PAIR,
     PAIRS,
+    PLACE,
+    SAMPLE,
+    SIGN,
+    TARGET,
     find_windows,
     list_gaps,
     place_pairs,
@@ -42,27 +51,20 @@ OVERFLOW = 1  # more crossings than the buffer holds
 def work(n_parts: int, size: int) -> tuple[Any, ...]:
     """Work arrays too large to be made anew at every call; `size` samples of a contour."""
     return (
-        zeros(n_parts, 4, LISTED, kind=np.int64),
-        zeros(n_parts, 2, LISTED, kind=np.int64),
-        zeros(n_parts, 3, LISTED, kind=np.float32),
-        zeros(n_parts, 4, LISTED, kind=np.float32),
-        zeros(n_parts, 13, LISTED, kind=np.float32),
+        zeros(n_parts, 6, LISTED, kind=np.int64),
+        zeros(n_parts, 20, LISTED, kind=np.float32),
         zeros(n_parts, 17, LISTED),
         zeros(n_parts, 2, PAIRS * (size + 5 * LANES), kind=np.float32),
     )
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", forceinline=True)
-def copy_gap(
-    source: int, to: int, place: Any, weight: Any, mean: Any, rows: Any, hints: Any
-) -> None:
+def copy_gap(source: int, to: int, rows: Any, piece: Any) -> None:
     """List a gap once more."""
-    place[to] = place[source]
-    weight[to] = weight[source]
-    mean[to] = mean[source]
-    for row in range(4):
-        rows[row, to] = rows[row, source]
-        hints[row, to] = hints[row, source]
+    for row in range(SAMPLE, TARGET, LISTED):
+        poke(rows, row + to, peek(rows, row + source))
+    for row in range(ANGLE, KIND, LISTED):
+        poke(piece, row + to, peek(piece, row + source))
 
 
 @shared(FLAGS)
@@ -75,8 +77,7 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
     """
     (
         record, grid, rim, pattern, circle, compass, first, owners, other, shift, roots, root_first,
-        root_last, lenses, inside, fault, gaps, places, weights, hints_of, pieces, lines_of,
-        samples,
+        root_last, lenses, inside, fault, gaps, pieces, lines_of, samples,
     ) = taken(kept)  # fmt: skip
     modes, _, _ = features_of(kept)
     n_cells = record.shape[0]
@@ -96,12 +97,6 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
     depth = samples[part, 0]
     change = samples[part, 1]
     rows = gaps[part]
-    place = places[part, 0]
-    target = places[part, 1]
-    weight = weights[part, 0]
-    mean = weights[part, 1]
-    kind = weights[part, 2]
-    hints = hints_of[part]
     piece = pieces[part]
     lines = lines_of[part]
     scratch = np.empty((2 * len(modes) + 4) * LANES)
@@ -136,31 +131,31 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
             )  # fmt: skip
             n_gaps = list_gaps(
                 pattern, owner, listed, start, count, filled, size, stride, depth, change,
-                place, weight, mean, rows, code, total,
+                rows, piece, code, total,
             )  # fmt: skip
             # First the first crossing of every gap; those with two are then listed once more.
             n_listed = n_gaps
             n_apart: Any = np.int64(0)
             for second in range(2):
                 judge_gaps(
-                    depth, change, place, weight, mean, second * n_gaps,
-                    n_listed if second else n_gaps, second == 1, spacing, piece, kind, hints,
+                    depth, change, rows, second * n_gaps, n_listed if second else n_gaps,
+                    second == 1, spacing, piece,
                 )  # fmt: skip
                 if second:
                     break
                 for begin_of_it in range(0, n_gaps, LANES):
-                    if bits(load(kind, begin_of_it) != 1.0) == np.uint64(0):
+                    if bits(load(piece, KIND + begin_of_it) != 1.0) == np.uint64(0):
                         continue  # the commonest case is counted already
                     for g in range(begin_of_it, min(begin_of_it + LANES, n_gaps)):
-                        number = int(peek(kind, g))
-                        k = peek(rows, LISTED + g) >> 2
+                        number = int(peek(piece, KIND + g))
+                        k = peek(rows, PAIR + g) >> 2
                         if number >= UNSURE and code[k] != CLOSELY:
                             after = -1
                             if number == UNSURE and n_apart + MOST_OF_A_GAP <= brackets.shape[0]:
                                 after = search_gap(
                                     record, owner[k], listed[k], apart[k, 0], apart[k, 1],
-                                    compass, rows[0, g] >> 2, depth[place[g]],
-                                    depth[place[g] + 1], modes, stack, brackets, n_apart,
+                                    compass, rows[0, g] >> 2, depth[peek(rows, PLACE + g)],
+                                    depth[peek(rows, PLACE + g) + 1], modes, stack, brackets, n_apart,
                                 )  # fmt: skip
                             if after < 0:
                                 code[k] = CLOSELY
@@ -168,13 +163,13 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
                                 pair_of[n_apart:after] = k
                                 number = after - n_apart
                                 n_apart = after
-                                kind[g] = 0.0
+                                poke(piece, KIND + g, 0.0)
                         poke(total, k, peek(total, k) + number - 1)
-                        if number == TWO and kind[g] > 0.0:
-                            copy_gap(g, n_listed, place, weight, mean, rows, hints)
+                        if number == TWO and peek(piece, KIND + g) > 0.0:
+                            copy_gap(g, n_listed, rows, piece)
                             n_listed += 1
                 for g in range(n_listed, n_listed + 2 * LANES):
-                    place[g] = LANES
+                    poke(rows, PLACE + g, LANES)
             for k in range(filled):
                 p = begin + k
                 number = peek(total, k)
@@ -240,34 +235,36 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
                 )  # fmt: skip
             partner = n_gaps
             for g in range(n_gaps):
-                number = int(peek(kind, g))
-                k = peek(rows, LISTED + g) >> 2
+                number = int(peek(piece, KIND + g))
+                k = peek(rows, PAIR + g) >> 2
                 dead = (peek(code, k) == CLOSELY) | (number == 0)
                 r = peek(cursor, k)
                 poke(cursor, k, r + number)
-                poke(target, g, ROOT * (dump if dead else r))
+                poke(rows, TARGET + g, ROOT * (dump if dead else r))
                 if number == TWO:
-                    poke(target, partner, ROOT * (dump if dead else r + 1))
+                    poke(rows, TARGET + partner, ROOT * (dump if dead else r + 1))
                     partner += 1
             for g in range(n_listed, (n_listed + LANES - 1) // LANES * LANES):
-                copy_gap(n_listed - 1, g, place, weight, mean, rows, hints)
-                target[g] = ROOT * dump
+                copy_gap(n_listed - 1, g, rows, piece)
+                poke(rows, TARGET + g, ROOT * dump)
             polish(
-                circle, apart, record, rows, hints, n_listed, modes, scratch, lines, target, roots
+                circle, apart, record, rows, piece, n_listed, modes, scratch, lines, roots
             )  # fmt: skip
             # What one step does not settle takes safeguarded ones.
             for begin_of_it in range(0, n_listed, LANES):
                 if bits(load_pair(lines, begin_of_it) < SETTLED) == EVERY:
                     continue
                 for g in range(begin_of_it, min(begin_of_it + LANES, n_listed)):
-                    if lines[0, g] < SETTLED or target[g] == ROOT * dump:
+                    if lines[0, g] < SETTLED or peek(rows, TARGET + g) == ROOT * dump:
                         continue
                     k = rows[1, g] // 4
                     s = rows[0, g] // 4
                     settle(
                         record, owner[k], listed[k], apart[k, 0], apart[k, 1], compass[0, s],
-                        compass[1, s], np.float64(hints[1, g]), np.float64(hints[2, g]),
-                        lines[1, g], np.float64(hints[3, g]), modes, roots, target[g] // ROOT,
+                        compass[1, s], np.float64(peek(piece, LOW + g)),
+                        np.float64(peek(piece, HIGH + g)), lines[1, g],
+                        np.float64(peek(piece, SIGN + g)), modes, roots,
+                        peek(rows, TARGET + g) // ROOT,
                     )  # fmt: skip
             # Nearly every pair has two crossings; those are summed up side by side.
             n_twice = 0
@@ -276,15 +273,14 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
                 r = peek(root_first, p)
                 number = peek(root_last, p) - r
                 if number == 2 and peek(roots, ROOT * r + 2) * peek(roots, ROOT * r + 10) < 0.0:
-                    poke(rows, n_twice, ROOT * r)
-                    poke(rows, LISTED + n_twice, ROOT * (r + 1))
-                    poke(target, n_twice, LENS * p)
+                    poke(rows, SAMPLE + n_twice, ROOT * r)
+                    poke(rows, PAIR + n_twice, ROOT * (r + 1))
+                    poke(rows, TARGET + n_twice, LENS * p)
                     n_twice += 1
                 elif number > 0:
                     sum_lens(roots, r, r + number, lenses, p)
             if n_twice > 0:
                 for k in range(n_twice, (n_twice + LANES - 1) // LANES * LANES):
-                    rows[0, k] = rows[0, n_twice - 1]
-                    rows[1, k] = rows[1, n_twice - 1]
-                    target[k] = target[n_twice - 1]
-                sum_lenses(roots, rows, n_twice, LISTED, lenses, target)
+                    for row in (SAMPLE, PAIR, TARGET):
+                        poke(rows, row + k, peek(rows, row + n_twice - 1))
+                sum_lenses(roots, rows, n_twice, PAIR, lenses, TARGET)

@@ -58,24 +58,24 @@ def sum_lens(roots: Any, begin: int, end: int, lenses: Any, p: int) -> None:
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
-def sum_lenses(roots: Any, rows: Any, count: int, room: int, lenses: Any, target: Any) -> None:
+def sum_lenses(roots: Any, rows: Any, count: int, seconds: int, lenses: Any, targets: int) -> None:
     """Sum up `count` pairs of two crossings each, of opposite signs.
 
-    `rows` says where the first crossing of each begins, `room` further on where the second does,
-    and `target` where its lens does; filled up to whole vectors.
+    `rows` says where the first crossing of each begins, `seconds` further on where the second does,
+    and `targets` further on where its lens does; filled up to whole vectors.
     """
     for k in range(0, count, LANES):
         c_a, s_a, sign, rho_a = gather_pair(roots, rows, k, 0)
-        c_b, s_b, _, rho_b = gather_pair(roots, rows, room + k, 0)
+        c_b, s_b, _, rho_b = gather_pair(roots, rows, seconds + k, 0)
         fx = sign * (rho_a * s_a - rho_b * s_b)
         fy = sign * (rho_b * c_b - rho_a * c_a)
         ti = (0.5 * sign) * (rho_a * rho_a - rho_b * rho_b)
         pi = c_a * c_b + s_a * s_b
         qi = sign * (s_a * c_b - c_a * s_b)
         c_a, s_a, sign, rho_a = gather_pair(roots, rows, k, 4)
-        c_b, s_b, _, rho_b = gather_pair(roots, rows, room + k, 4)
+        c_b, s_b, _, rho_b = gather_pair(roots, rows, seconds + k, 4)
         tj = (0.5 * sign) * (rho_a * rho_a - rho_b * rho_b)
-        scatter_rows(lenses, target, k, 0, fx, fy, ti, tj)
+        scatter_rows(lenses, rows, targets + k, 0, fx, fy, ti, tj)
         pj = c_a * c_b + s_a * s_b
         qj = sign * (s_a * c_b - c_a * s_b)
-        scatter_rows(lenses, target, k, 4, pi, qi, pj, qj)
+        scatter_rows(lenses, rows, targets + k, 4, pi, qi, pj, qj)

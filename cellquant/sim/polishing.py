@@ -28,7 +28,22 @@ from cellquant.sim.lanes import (
     widen_pair,
 )
 from cellquant.sim.records import HEAD
-from cellquant.sim.sampling import LISTED
+from cellquant.sim.sampling import (
+    ANGLE,
+    HIGH,
+    INNER,
+    KIND,
+    LISTED,
+    LOW,
+    MEAN,
+    OTHER,
+    OWNER,
+    PAIR,
+    PLACE,
+    SAMPLE,
+    SIGN,
+    TARGET,
+)
 
 END_MARGIN = 2e-6  # of a sample in single precision, relative to A0
 FINE_MARGIN = 1e-5  # of the interpolation through four samples, single precision included
@@ -83,10 +98,10 @@ def height(piece: Any, room: int, g: int, t: Any) -> Any:
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def judge_gaps(
-    depth: Any, change: Any, place: Any, weight: Any, mean: Any, begin: int, end: int,
-    second: bool, spacing: float, piece: Any, kind: Any, hints: Any,
+    depth: Any, change: Any, rows: Any, begin: int, end: int, second: bool, spacing: float,
+    piece: Any,
 ) -> None:  # fmt: skip
-    """How often the depth crosses zero in every gap, and where (see `polish` for `hints`).
+    """How often the depth crosses zero in every gap, and where (ANGLE to SIGN of `piece`).
 
     With the samples beyond both ends the interpolation is of degree 7: the cubic p(t) through the
     ends plus t^2 (t - 1)^2 q(t), q cubic. The crossing is the first one in the gap, or the second
@@ -97,9 +112,9 @@ def judge_gaps(
     """
     room = LISTED
     for g in range(begin, end, 2 * LANES):
-        before, g0, g1, after = gather_pair(depth, place, g, -1)
-        e_before, e0, e1, e_after = gather_pair(change, place, g, -1)
-        share = choose(load_pair(weight, g) > 0.0, singles_pair(0.25), singles_pair(0.0))
+        before, g0, g1, after = gather_pair(depth, rows, PLACE + g, -1)
+        e_before, e0, e1, e_after = gather_pair(change, rows, PLACE + g, -1)
+        share = choose(load_pair(piece, INNER + g) > 0.0, singles_pair(0.25), singles_pair(0.0))
         difference = g1 - g0
         c2 = 3.0 * difference - 2.0 * e0 - e1
         c3 = e0 + e1 - 2.0 * difference
@@ -127,10 +142,10 @@ def judge_gaps(
         e0 = load_pair(piece, room + g)
         c2 = load_pair(piece, 2 * room + g)
         c3 = load_pair(piece, 3 * room + g)
-        a0 = load_pair(mean, g)
+        a0 = load_pair(piece, MEAN + g)
         g1 = load_pair(piece, 8 * room + g)
         flat = HULL_MARGIN * a0
-        inner = load_pair(weight, g)
+        inner = load_pair(piece, INNER + g)
         # What degree 7 changes, at both ends and in the middle, tells what it leaves.
         q0 = load_pair(piece, 4 * room + g)
         q1 = load_pair(piece, 5 * room + g)
@@ -175,18 +190,18 @@ def judge_gaps(
             high = pick(change_3, one, pick(change_2, t2, t1))
             begin_of_it = pick(change_1, t1, t2)
             end_of_it = singles_pair(1.0 + BEYOND)
-            store(hints, 3 * room + g, pick(g0, one, -one))
+            store(piece, SIGN + g, pick(g0, one, -one))
         else:
             # The first piece between extrema that crosses zero, or else the last one.
             hidden = pick(ROUGH * a0 - bent, singles_pair(HIDDEN), singles_pair(UNSURE))
-            store(kind, g, pick(either(unsure, ROUGH * a0 - bent), hidden, number))
+            store(piece, KIND + g, pick(either(unsure, ROUGH * a0 - bent), hidden, number))
             low = pick(change_1, none, pick(change_2, t1, t2))
             high = pick(change_1, t1, pick(change_2, t2, one))
             begin_of_it = singles_pair(-BEYOND)
-            store(hints, 3 * room + g, pick(g0, -one, one))
+            store(piece, SIGN + g, pick(g0, -one, one))
             end_of_it = choose(number == TWO, pick(change_1, t1, t2), 1.0 + BEYOND)
-        store(hints, room + g, begin_of_it * spacing)
-        store(hints, 2 * room + g, end_of_it * spacing)
+        store(piece, LOW + g, begin_of_it * spacing)
+        store(piece, HIGH + g, end_of_it * spacing)
         # From an extremum, of height p2 at t2 and else p1, the parabola through it leads close.
         turning = choose(low > 0.0, low, high)
         value = choose(turning == t2, p2, p1)
@@ -205,7 +220,7 @@ def judge_gaps(
     for g in range(begin, end, 2 * LANES):
         t = load_pair(piece, 12 * room + g)
         t = greatest(least(t, load_pair(piece, 11 * room + g)), load_pair(piece, 10 * room + g))
-        store(hints, g, t * spacing)
+        store(piece, ANGLE + g, t * spacing)
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
@@ -224,7 +239,7 @@ def radii(
         c = load_pair(lines, column * room + r)
         s = load_pair(lines, (column + 1) * room + r)
         for m in range(0, 2 * n_modes + 1, 4):
-            c0, c1, c2, c3 = gather_pair(record, rows, row * room + r, HEAD + m)
+            c0, c1, c2, c3 = gather_pair(record, rows, row + r, HEAD + m)
             store(scratch, m * LANES, c0)
             store(scratch, m * LANES + LANES, c1)
             store(scratch, m * LANES + 2 * LANES, c2)
@@ -256,21 +271,19 @@ def radii(
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def polish(
-    circle: Any, apart: Any, record: Any, rows: Any, hints: Any, count: int, modes: Any,
-    scratch: Any, lines: Any, target: Any, roots: Any,
+    circle: Any, apart: Any, record: Any, rows: Any, piece: Any, count: int, modes: Any,
+    scratch: Any, lines: Any, roots: Any,
 ) -> None:  # fmt: skip
     """Step of order three on the crossing in every listed gap, then its data.
 
-    Rows of `rows`: where the numbers of its sample, its pair, i and j begin. Rows of `hints`: angle
-    from the sample, the bracket and the sign. `target` says where in `roots` the row of each root
-    begins; row 0 of `lines` takes its error, row 1 the angle. Each pass is short, so that
-    operations seldom wait for each other.
+    See `sampling` for `rows` and `piece`. Row 0 of `lines` takes the error of every crossing, row 1
+    the angle. Each pass is short, so that operations seldom wait for each other.
     """
     room = LISTED
     jerk = 1.0 * (len(modes) + 1) ** 2  # a sixth of the third derivative of rho over A0, and more
     for r in range(0, count, LANES):
-        c, s, _, _ = gather_pair(circle, rows, r, 0)
-        angle = widen_pair(hints, r)
+        c, s, _, _ = gather_pair(circle, rows, SAMPLE + r, 0)
+        angle = widen_pair(piece, ANGLE + r)
         q = angle * angle
         # Angles are below 0.14: what the series lack is below 1e-17.
         sine = 1 / 120 + q * (-1 / 5040 + q * (1 / 362880))
@@ -287,7 +300,7 @@ def polish(
                 rho = load_pair(lines, 2 * room + r)
                 slope = load_pair(lines, 3 * room + r)
                 curve = load_pair(lines, 4 * room + r)
-                dx, dy, _, _ = gather_pair(apart, rows, room + r, 0)
+                dx, dy, _, _ = gather_pair(apart, rows, PAIR + r, 0)
                 x = rho * c - dx
                 y = rho * s - dy
                 tx = slope * c - rho * s
@@ -311,7 +324,7 @@ def polish(
                 store(lines, 14 * room + r, ((ux * ny - uy * nx) - 2.0 * away * turn) * inverse)
                 store(lines, 15 * room + r, dx)
                 store(lines, 16 * room + r, dy)
-        radii(record, rows, 2 + side, count, modes, scratch, lines, 5 * side)
+        radii(record, rows, OTHER if side else OWNER, count, modes, scratch, lines, 5 * side)
     for r in range(0, count, LANES):
         depth = load_pair(lines, 7 * room + r) - load_pair(lines, 10 * room + r)
         turn = load_pair(lines, 12 * room + r)
@@ -335,13 +348,13 @@ def polish(
         y = rho * s - load_pair(lines, 16 * room + r)
         square = x * x + y * y
         inverse = 1.0 / root(square)
-        moved = widen_pair(hints, r) + step
-        inside = (moved > widen_pair(hints, room + r)) & (moved < widen_pair(hints, 2 * room + r))
+        moved = widen_pair(piece, ANGLE + r) + step
+        inside = (moved > widen_pair(piece, LOW + r)) & (moved < widen_pair(piece, HIGH + r))
         # What is left out is of order three: of the step, and of the radius there.
         error = absolute(newton) * (jerk * newton * newton + 2.0 * second * second)
         error = choose(inside, error, 1.0)
         store(lines, r, error)
         store(lines, room + r, moved)
-        sign = widen_pair(hints, 3 * room + r)
-        scatter_rows(roots, target, r, 0, c, s, sign, rho)
-        scatter_rows(roots, target, r, 4, x * inverse, y * inverse, -sign, square * inverse)
+        sign = widen_pair(piece, SIGN + r)
+        scatter_rows(roots, rows, TARGET + r, 0, c, s, sign, rho)
+        scatter_rows(roots, rows, TARGET + r, 4, x * inverse, y * inverse, -sign, square * inverse)

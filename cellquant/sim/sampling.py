@@ -38,6 +38,13 @@ PAIRS = 112  # pairs whose contours are sampled before the gaps between samples 
 MANY = 12  # gaps of one pair that may hold a crossing; with more it is searched in double precision
 FULL = 4 * PAIRS  # gaps of all of them; pairs for which there is no room are searched in it too
 LISTED = 2 * FULL + 4 * LANES  # gaps and second crossings, and room to read on
+# What is known of gaps is kept in two tables whose widths are known when kernels are compiled: one
+# address leads to all rows. In whole numbers: where the numbers of its sample, its pair, i and j
+# begin, the place of its sample, and where its crossing goes.
+SAMPLE, PAIR, OWNER, OTHER, PLACE, TARGET = range(0, 6 * LISTED, LISTED)
+# In single precision, after 13 rows of `judge_gaps`: angle from the sample, bracket and sign; then
+# 0 where there is no sample before or after the gap (else 1), A0 of j, and how many crossings.
+ANGLE, LOW, HIGH, SIGN, INNER, MEAN, KIND = range(13 * LISTED, 20 * LISTED, LISTED)
 CLOSELY, OUTSIDE, INSIDE = -1, -2, -3  # what a pair without gaps is
 NARROW = 0.1  # smallest radius over A0 for which single precision is trusted
 FAST = 3.0  # turns round the centre of j per turn of i, above which modes of j are undersampled
@@ -191,16 +198,14 @@ def sample_pairs(
 @njit(cache=True, fastmath=FLAGS, error_model="numpy", inline="always")
 def list_gaps(
     pattern: Any, owner: Any, other: Any, starts: Any, counts: Any, filled: int, size: int,
-    stride: int, depth: Any, change: Any, place: Any, weight: Any, mean: Any, rows: Any,
-    codes: Any, numbers: Any,
+    stride: int, depth: Any, change: Any, rows: Any, piece: Any, codes: Any, numbers: Any,
 ) -> int:  # fmt: skip
     """List the gaps between samples that may hold a crossing; return their number.
 
-    Of each gap `place` takes the index of the sample before it, `weight` 0 where there is no
-    sample before or after the gap (else 1), and `mean` the A0 of j; for `rows` see `polish`.
-    `numbers` takes how many there are of every pair, and
-    `codes` takes CLOSELY where a pair must be searched in double precision (also where that is
-    given), or else OUTSIDE where the first sample lies outside of j and INSIDE where it does not.
+    `rows` and `piece` take what is known of each so far: all of the first but TARGET, and INNER and
+    MEAN. `numbers` takes how many there are of every pair, and `codes` takes CLOSELY where a pair
+    must be searched in double precision (also where that is given), or else OUTSIDE where the first
+    sample lies outside of j and INSIDE where it does not.
     """
     room = size + 5 * LANES
     base: Any = np.int64(0)  # a plain 0 would have callers compiled twice
@@ -234,12 +239,12 @@ def list_gaps(
             # Four at a time, whether there are as many or not, to spare the branches.
             for g in range(base, base + number, 4):
                 for q in range(4):
-                    poke(place, g + q, (pair << 16) + s + trailing_zeros(word | END))
+                    poke(rows, PLACE + g + q, (pair << 16) + s + trailing_zeros(word | END))
                     word &= word - np.uint64(1)
             base += number
         poke(numbers, pair, base - first)
     for g in range(base):
-        code = peek(place, g)
+        code = peek(rows, PLACE + g)
         pair = code >> 16
         t = code & 65535
         count = int(peek(counts, pair))
@@ -247,13 +252,13 @@ def list_gaps(
         at = int(peek(starts, pair)) + t
         at -= size if at >= size else 0
         j = peek(other, pair)
-        poke(place, g, pair * room + LANES + t)
-        poke(weight, g, 0.0 if edge else 1.0)
-        poke(mean, g, peek(pattern, long * j))
-        poke(rows, g, 4 * at)
-        poke(rows, LISTED + g, 4 * pair)
-        poke(rows, 2 * LISTED + g, stride * peek(owner, pair))
-        poke(rows, 3 * LISTED + g, stride * j)
+        poke(rows, PLACE + g, pair * room + LANES + t)
+        poke(piece, INNER + g, 0.0 if edge else 1.0)
+        poke(piece, MEAN + g, peek(pattern, long * j))
+        poke(rows, SAMPLE + g, 4 * at)
+        poke(rows, PAIR + g, 4 * pair)
+        poke(rows, OWNER + g, stride * peek(owner, pair))
+        poke(rows, OTHER + g, stride * j)
     for g in range(base, base + 2 * LANES):
-        place[g] = LANES  # what fills up the last vector
+        poke(rows, PLACE + g, LANES)  # what fills up the last vector
     return int(base)
