@@ -152,10 +152,11 @@ def crossings(part: int, n_parts: int, kept: Any, state: Any, velocity: Any) -> 
                         if number >= UNSURE and code[k] != CLOSELY:
                             after = -1
                             if number == UNSURE and n_apart + MOST_OF_A_GAP <= brackets.shape[0]:
+                                at = peek(rows, PLACE + g)
                                 after = search_gap(
                                     record, owner[k], listed[k], apart[k, 0], apart[k, 1],
-                                    compass, rows[0, g] >> 2, depth[peek(rows, PLACE + g)],
-                                    depth[peek(rows, PLACE + g) + 1], modes, stack, brackets, n_apart,
+                                    compass, peek(rows, SAMPLE + g) >> 2, depth[at],
+                                    depth[at + 1], modes, stack, brackets, n_apart,
                                 )  # fmt: skip
                             if after < 0:
                                 code[k] = CLOSELY
