@@ -246,6 +246,7 @@ def exact_velocity(part: int, n_parts: int, kept: Any, state: Any, velocity: Any
                 rows[column] = i * record.shape[1]
                 rows[QUAD + column] = i * tangent.shape[1]
             fill_lanes(record, tangent, rows, modes, tension, lane)
+            # Lenses that others list, which the next tile needs.
             for b in range(
                 back_first[min(begin + QUAD, end)], back_first[min(begin + 2 * QUAD, end)]
             ):
