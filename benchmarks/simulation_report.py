@@ -109,8 +109,8 @@ def main():
             "every evaluation tells when: turns count as undisturbed where it takes at most 5 % "
             "longer than at its best. The ratio of the least times is "
             f"{number(cost['ratio_of_least'])}. From one start of the process to the next the "
-            "40-point rule mostly takes 935 to 975 us; in two of some thirty starts it took 1055 and "
-            "1316, and the ratio was 0.84 and 0.70. Such starts are not shown here. All turns of "
+            "40-point rule mostly takes 935 to 975 us; two of some thirty starts took 1055 and "
+            "1316 us, with ratios of 0.84 and 0.70. Such starts are not shown here. All turns of "
             "runs in which another machine kept the core busy gave ratios of 1.02 to 1.13.\n"
         )
         header = ["turns", "number", "exact, us", "40 points, us", "ratio", "quartiles",
